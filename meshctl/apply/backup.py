@@ -50,6 +50,7 @@ _OWN = (
     *("/etc/meshctl/change", "/etc/meshctl/last", *deadman.installed_files()),
     *("/tmp/", "/var/", "/dev/", "/proc/", "/sys/"),
 )
+_REACHABLE_BY = ("network", "wireless", "dropbear", "firewall")
 # What a cell is read from.
 _CELL_PATHS = (WIRELESS, f"{CONFIG}network")
 # From 24.10 on sysupgrade adds a script to every archive that disables, at the next boot, the services that were
@@ -89,10 +90,20 @@ def fetch(connection: SshConnection, node: str, observation: Observation) -> byt
         # sysupgrade does not save meshctl's own files; the marker identifies the configuration
         own = openwrt.fetch_files(connection, [f"/{MARKER_PATH}"])
         whole = with_info(archive, info, {path: file.content for path, file in own.items()})
-        read_backup(whole, node)
+        backup = read_backup(whole, node)
     except InputError as error:
         raise NodeError(f"{node}: expected a backup archive: {error}") from error
+    if missing := left_out(backup, observation):
+        hint = "add a line `/etc/config/` to /etc/sysupgrade.conf on it: its /lib/upgrade/keep.d lacks one"
+        raise NodeError(f"{node}: its `sysupgrade -b` leaves out {', '.join(missing)}: nothing was saved", hint=hint)
     return whole
+
+
+def left_out(backup: Backup, observation: Observation) -> tuple[str, ...]:
+    """The observed UCI files, of those that make a node reachable, that the archive lacks. A restore would leave them
+    as they are then, and report success."""
+    paths = (f"/{CONFIG}{package}" for package in _REACHABLE_BY if package in (observation.uci or {}))
+    return tuple(path for path in paths if path not in backup.files)
 
 
 def unconfirmed(node: str, before: ChangeStatus | None, after: ChangeStatus) -> str:

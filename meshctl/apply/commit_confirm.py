@@ -147,6 +147,9 @@ def _act(change: ChangeInProgress, connection: SshConnection, *, is_proof: bool)
             return Outcome(name, Result.DONE)
         case Action.WENT_BACK:
             unlock(change, connection)
+            if change.started_s is None and change.status.last_id != change.id:
+                # a power cut has taken what was staged; the node's last reason is that of an earlier change
+                return Outcome(name, Result.FAILED, "nothing was changed")
             why = rollback_reason(change.status, change.unmet, change.login_refused, change.connect_error)
             flashed = flashed_by_others(change.ctx.before, change.last)
             return Outcome(name, Result.ROLLED_BACK, f"{flashed}{why}")

@@ -17,6 +17,7 @@ from meshctl.apply.backup import (
     Backup,
     departure,
     incompatibility,
+    left_out,
     lockout_by,
     read_backup,
     unconfirmed,
@@ -155,3 +156,13 @@ def test_a_backup_from_before_a_change_of_the_key_is_not_restored() -> None:
     )
     assert "(radio0: key changes)" in refused
     assert "horse" not in refused
+
+
+def test_an_archive_without_a_file_that_the_node_has_is_no_backup() -> None:
+    """Seen with an image whose keep.d lacks /etc/config: a restore was done, and had restored nothing."""
+    seen = running(fleet(), "b01")
+    whole = _backup_of(seen)
+    assert left_out(whole, seen) == ()
+    files = {path: file for path, file in whole.files.items() if path != "/etc/config/wireless"}
+    assert left_out(replace(whole, files=files), seen) == ("/etc/config/wireless",)
+    assert left_out(replace(whole, files=files), replace(seen, uci=None)) == ()

@@ -10,7 +10,7 @@ from typing import cast
 
 import pytest
 
-from meshctl.apply import change_in_progress
+from meshctl.apply import change_in_progress, commit_confirm
 from meshctl.apply.change_in_progress import ROLLBACK_S, ChangeInProgress, connect, observe_and_decide
 from meshctl.apply.commit_confirm import _observe_once, _uncertain
 from meshctl.apply.context import NodeContext
@@ -161,3 +161,25 @@ def test_a_node_that_stays_unreachable_before_its_change_has_started_was_not_cha
     change = SimpleNamespace(ctx=SimpleNamespace(name="b01", run=run), started_s=None, last_error="no route to host")
     outcome = _uncertain(cast("ChangeInProgress", change))
     assert outcome == Outcome("b01", Result.FAILED, "nothing was changed: no route to host")
+
+
+@pytest.mark.parametrize(
+    ("last_id", "outcome"),
+    [
+        ("c0", Outcome("b01", Result.FAILED, "nothing was changed")),
+        ("c1", Outcome("b01", Result.ROLLED_BACK, "its power was cut, or it rebooted, before it was confirmed")),
+    ],
+)
+def test_a_change_that_left_no_trace_does_not_get_the_reason_of_an_earlier_one(
+    monkeypatch: pytest.MonkeyPatch, last_id: str, outcome: Outcome
+) -> None:
+    """Seen on real OpenWrt: b01's power was cut as a switch was armed, and it `rolled back: it was canceled`."""
+    status = ChangeStatus("idle", last_id=last_id, last_outcome="restored", last_reason="boot")
+    monkeypatch.setattr(commit_confirm, "observe_and_decide", lambda *_, **__: Action.WENT_BACK)
+    monkeypatch.setattr(commit_confirm, "unlock", lambda *_: None)
+    ctx = SimpleNamespace(name="b01", before=Observation(0.0, 0.1))
+    change = SimpleNamespace(
+        ctx=ctx, id="c1", started_s=None, status=status, unmet=(), login_refused="", connect_error="", last=None
+    )
+    connection = cast("SshConnection", None)
+    assert commit_confirm._act(cast("ChangeInProgress", change), connection, is_proof=False) == outcome
