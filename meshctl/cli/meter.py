@@ -17,12 +17,13 @@ import typer
 
 from meshctl.cli.context import AsJson
 from meshctl.cli.fleet_view import FleetView, collect, paint_of, with_fleet_view
+from meshctl.cli.inventory_versions import BeaconStock
 from meshctl.cli.live_screen import live_screen
 from meshctl.cli.output import echo, echo_json
 from meshctl.cli.voice import Voice
 from meshctl.errors import ExitCode, InputError
 from meshctl.inventory.suggest import did_you_mean
-from meshctl.nodes.link_looks import HopMargins, LinkWatch, assemble, carried_beacons, own_radios
+from meshctl.nodes.link_looks import HopMargins, LinkWatch, assemble, own_radios
 from meshctl.placement.margin import MAX_SHARED_HOPS, required_snr_db
 from meshctl.placement.meter import Advice, Meter, Position, Reading
 from meshctl.placement.reading import is_due_to_speak, line, page, reading_json, style_of, words
@@ -94,7 +95,7 @@ def meter(
         Meter(needed_db),
         HopMargins(needed_db),
         _Positions(fleet_view, robot, LocalDaemon(socket_path(daemon))),
-        carried_beacons(fleet_view.fleet, robot) if beacons is None and robot in fleet_view.fleet.robots else beacons,
+        BeaconStock(fleet_view.fleet, robot).count if beacons is None else lambda: beacons,
         spacing,
         fleet_view.opened.access.meter.totals,
         deploy,
@@ -181,7 +182,7 @@ class _ReadingSource:
     meter: Meter
     margins: HopMargins
     positions: _Positions
-    beacons: int | None
+    stock: Callable[[], int | None]
     spacing_m: float | None
     traffic: Callable[[], dict[str, int]]
     deploy: str
@@ -224,7 +225,7 @@ class _ReadingSource:
             fresh=fresh,
             position=position,
             heading_rad=heading_rad,
-            beacons=self.beacons,
+            beacons=self.stock(),
             spacing_m=self.spacing_m,
         )
         reading = self.meter.step(look)
