@@ -10,10 +10,10 @@ import time
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import NoReturn
 
 from meshctl.cli.fleet_view import FleetView, collect
+from meshctl.cli.inventory_versions import versions
 from meshctl.cli.output import echo
 from meshctl.errors import InputError
 from meshctl.model import Fleet, Node
@@ -76,8 +76,8 @@ def _watch_one_version(
     period_s: float,
 ) -> None:
     """Until a file of the inventory changes, also by `mark`."""
-    before = _versions(view.fleet)
-    while _versions(view.fleet) == before:
+    before = versions(view.fleet)
+    while versions(view.fleet) == before:
         began_s = time.monotonic()
         dropped = dropped_in(view, chosen)
         known = snapshots.suspects
@@ -91,16 +91,3 @@ def _watch_one_version(
         if confirmed:
             mark([node for node in chosen if node.name in confirmed])
         time.sleep(max(0.0, period_s - (time.monotonic() - began_s)))
-
-
-def _versions(fleet: Fleet) -> tuple[tuple[int, int] | None, ...]:
-    """Changes with every edit of a file of the inventory."""
-    found: list[tuple[int, int] | None] = []
-    for file in fleet.files:
-        try:
-            state = Path(file).stat()
-        except OSError:
-            found.append(None)
-        else:
-            found.append((state.st_mtime_ns, state.st_size))
-    return tuple(found)

@@ -8,23 +8,25 @@ import os
 import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from meshctl.cli.beacon_drop import BeaconDrop
 from meshctl.cli.context import AsJson
 from meshctl.cli.fleet_view import FleetView, collect, paint_of, with_fleet_view
+from meshctl.cli.inventory_versions import BeaconStock
 from meshctl.cli.live_screen import live_screen
 from meshctl.cli.output import echo, echo_json
 from meshctl.cli.voice import Voice
 from meshctl.errors import ExitCode, InputError
 from meshctl.inventory.suggest import did_you_mean
-from meshctl.nodes.link_looks import HopMargins, LinkWatch, assemble, carried_beacons, own_radios
+from meshctl.nodes.link_looks import HopMargins, LinkWatch, assemble, own_radios
 from meshctl.placement.margin import MAX_SHARED_HOPS, required_snr_db
-from meshctl.placement.meter import Advice, Meter, Position, Reading
+from meshctl.placement.meter import Meter, Position, Reading
 from meshctl.placement.reading import is_due_to_speak, line, page, reading_json, style_of, words
 from meshctl.robots.local_daemon import DaemonError, LocalDaemon, socket_path
 from meshctl.robots.position_facts import positions_in
@@ -34,10 +36,6 @@ DEFAULT_LOAD_MBIT_S = 2.0
 _HEADING_M = 3.0
 # A position of the robot's daemon comes every two seconds while it drives.
 _MAX_POSITION_AGE_S = 6.0
-_DEPLOY = {
-    "ros1": ("std_msgs/Bool", b"\x01"),
-    "ros2": ("std_msgs/msg/Bool reliable:volatile:1:", b"\x00\x01\x00\x00\x01"),
-}
 
 
 @with_fleet_view
@@ -82,8 +80,10 @@ def meter(
 
     Example: meshctl meter spot1 --json --count 1
     """
-    if deploy and deploy not in _DEPLOY:
-        raise InputError(f"--deploy: expected ros1 or ros2, found {deploy!r}")
+    local = LocalDaemon(socket_path(daemon))
+    drop = BeaconDrop(local, robot, deploy) if deploy else None
+    if drop is not None:
+        drop.check()
     voice = Voice() if speak else None
     # a path of beacons soon has as many hops
     needed_db = required_snr_db(load, MAX_SHARED_HOPS)
@@ -93,11 +93,11 @@ def meter(
         watch,
         Meter(needed_db),
         HopMargins(needed_db),
-        _Positions(fleet_view, robot, LocalDaemon(socket_path(daemon))),
-        carried_beacons(fleet_view.fleet, robot) if beacons is None and robot in fleet_view.fleet.robots else beacons,
+        _Positions(fleet_view, robot, local),
+        BeaconStock(fleet_view.fleet, robot).count if beacons is None else lambda: beacons,
         spacing,
         fleet_view.opened.access.meter.totals,
-        deploy,
+        drop,
         voice,
     )
     if as_json or count is not None or not sys.stdout.isatty():
@@ -107,6 +107,8 @@ def meter(
             if source.sound_problem != shown:
                 shown = source.sound_problem
                 echo(shown or "the sound works again", err=True)
+            if source.note:
+                echo(source.note, err=True)
         if voice is not None:
             voice.wait()
         raise typer.Exit
@@ -181,18 +183,17 @@ class _ReadingSource:
     meter: Meter
     margins: HopMargins
     positions: _Positions
-    beacons: int | None
+    stock: Callable[[], int | None]
     spacing_m: float | None
     traffic: Callable[[], dict[str, int]]
-    deploy: str
+    drop: BeaconDrop | None
     voice: Voice | None
     bytes_per_s: float | None = None
     _seen_s: float = 0.0
     _counted: tuple[float, int] | None = None
     _spoken: Reading | None = None
-    _was: Advice = Advice.GO
     _steps: int = 0
-    _note: str = field(default="")
+    note: str = ""
 
     def readings(self, count: int | None) -> Iterator[Reading]:
         """Readings at an interval of a second, from the first answer on."""
@@ -224,7 +225,7 @@ class _ReadingSource:
             fresh=fresh,
             position=position,
             heading_rad=heading_rad,
-            beacons=self.beacons,
+            beacons=self.stock(),
             spacing_m=self.spacing_m,
         )
         reading = self.meter.step(look)
@@ -240,7 +241,7 @@ class _ReadingSource:
     def footer(self) -> str:
         """The airtime cost of the queries, and the latest problem."""
         cost = "?" if self.bytes_per_s is None else f"{self.bytes_per_s / 1000:.1f}"
-        problem = self.watch.problem() or self._note or self.sound_problem
+        problem = self.watch.problem() or self.note or self.sound_problem
         return f"queries cost {cost} kB/s on the air; Ctrl-C to quit{f'; {problem}' if problem else ''}"
 
     def _count_bytes(self) -> None:
@@ -255,16 +256,14 @@ class _ReadingSource:
 
     def _publish(self, reading: Reading) -> None:
         """The reading to local programs, and DROP NOW to the robot, once per change."""
-        drops, self._was = reading.advice is Advice.DROP_NOW and self._was is not Advice.DROP_NOW, reading.advice
+        answers, self.note = True, ""
         try:
             self.positions.daemon.request("publish-meter", json.dumps(self.json(reading)).encode())
-            if drops and self.deploy:
-                kind, payload = _DEPLOY[self.deploy]
-                self.positions.daemon.request("publish", payload, topic="deploy_beacon", to=self.robot, type=kind)
-            self._note = ""
         except DaemonError as error:
             # without --deploy, it is enough that the reading is shown here
-            self._note = str(error) if self.deploy else ""
+            answers, self.note = bool(error.code), str(error) if self.drop is not None else ""
+        if self.drop is not None and (problem := self.drop.step(reading.advice, answers=answers)):
+            self.note = f"{problem}; {self.note}" if self.note else problem
 
     @property
     def sound_problem(self) -> str:
