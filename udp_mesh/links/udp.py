@@ -32,7 +32,7 @@ from udp_mesh.links.source_filter import (
 
 SOL_UDP, UDP_SEGMENT, UDP_GRO = 17, 103, 104
 SO_REUSEPORT, SO_BINDTODEVICE, SO_RCVBUFFORCE, SO_TIMESTAMPNS = 15, 25, 33, 35
-IP_MTU_DISCOVER, IPV6_MTU_DISCOVER, PMTUDISC_INTERFACE = 10, 23, 4
+IP_MTU_DISCOVER, IPV6_MTU_DISCOVER, PMTUDISC_OMIT = 10, 23, 5
 
 MAX_SEGMENTS = 64
 """UDP_MAX_SEGMENTS of older kernels (newer ones allow 128)."""
@@ -166,10 +166,11 @@ class UdpLink:
         own.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
         # Anyone can forge an ICMP error that makes the kernel cut our datagrams into IP packets of 552 bytes for ten
         # minutes, of which some networks drop all. The core finds the path MTU by what arrives (`core.sender.pmtu`).
+        # IP_PMTUDISC_INTERFACE ignores these errors as well, but refuses what was cut for a link before its MTU shrank.
         if own.family == socket.AF_INET:
-            own.setsockopt(socket.IPPROTO_IP, IP_MTU_DISCOVER, PMTUDISC_INTERFACE)
+            own.setsockopt(socket.IPPROTO_IP, IP_MTU_DISCOVER, PMTUDISC_OMIT)
         else:
-            own.setsockopt(socket.IPPROTO_IPV6, IPV6_MTU_DISCOVER, PMTUDISC_INTERFACE)
+            own.setsockopt(socket.IPPROTO_IPV6, IPV6_MTU_DISCOVER, PMTUDISC_OMIT)
             # IPv4 has a socket of its own, and our own multicasts need not come back.
             own.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
             own.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_MULTICAST_LOOP, 0)
@@ -263,7 +264,11 @@ class UdpLink:
         return done
 
     def _run_end(self, datagrams: Sequence[OutgoingDatagram], start: int) -> int:
-        """The end of the run from `start`: same destination and urgency, same size; the last one may be shorter."""
+        """The end of the run from `start`: same destination and urgency, same size; the last one may be shorter.
+
+        Of urgent ones it may not: probes of several sizes are sent together, and a router may drop a run for its
+        largest datagram before it is segmented.
+        """
         first = datagrams[start]
         size, destination, urgent = len(first.data), first.destination, first.urgent
         end = start + 1
@@ -272,6 +277,8 @@ class UdpLink:
             following = datagrams[end]
             length = len(following.data)
             if following.destination != destination or following.urgent != urgent or length > size:
+                break
+            if urgent and length < size:
                 break
             end += 1
             if length < size:

@@ -5,7 +5,7 @@ import random
 from hypothesis import given
 from hypothesis import strategies as st
 
-from udp_mesh.crypto.replay import WINDOW_PACKETS, ReplayWindow
+from udp_mesh.crypto.replay import AGE_STEP_S, WINDOW_PACKETS, ReplayWindow
 
 
 @given(st.integers(0, 1 << 40), st.lists(st.integers(-5000, 5000), max_size=80), st.integers(0, 10_000))
@@ -51,3 +51,17 @@ def test_the_accepted_share_counts_the_newest_numbers(numbers: set[int], first: 
     counted = range(max(first, max(numbers) - newest + 1), max(numbers) + 1)
     expected = len(numbers.intersection(counted)) / len(counted) if len(counted) >= least else None
     assert window.accepted_share(first, newest, least) == expected
+
+
+def test_a_number_is_too_old_two_steps_after_a_larger_one_and_the_floor_never_sinks() -> None:
+    window = ReplayWindow()
+    window.accept(100)
+    for step in range(3):
+        window.age(step * AGE_STEP_S)
+        assert window.would_accept(50)
+    window.age(3 * AGE_STEP_S)
+    assert not window.would_accept(50)
+    assert window.would_accept(101)
+    window.raise_floor(500)
+    window.age(4 * AGE_STEP_S)
+    assert window.floor == 500

@@ -254,6 +254,30 @@ def interface_too_narrow() -> None:
         both.exchange()
 
 
+def interface_narrows_after_sending() -> None:
+    """A message was sent completely and lost when the interface's MTU shrinks: under another number it could arrive
+    twice, so it keeps its fragments, which the kernel cuts."""
+    with pair() as both:
+        both.join("mesh0")
+        for number, daemon in enumerate((both.alice, both.bob), 1):
+            both.ip(daemon, f"addr add 10.7.20.{number}/20 broadcast + dev mesh0")
+        met(both)
+        with both.alice.client() as sender, both.bob.client() as receiver:
+            receiver.subscribe("map")
+            both.ip(both.bob, "xfrm policy add dir in src 10.7.20.1/32 action block")
+            sender.publish("map", bytes(5000), to="bob", notify=True)
+            under_way(both.alice, 4)
+            for daemon in (both.alice, both.bob):
+                both.ip(daemon, "link set mesh0 mtu 1000")
+            poll(lambda: mtu_of(both.alice, "mesh0") == 1000, "alice knows the new MTU")
+            both.ip(both.bob, "xfrm policy flush")
+            (message,) = collect(receiver, 1)
+            assert message.payload == bytes(5000)
+            assert list(outcomes(sender, 1).values()) == ["delivered"]
+        both.exchange()
+        assert "Message too long" not in both.alice.log.read_text()
+
+
 def sending_is_forbidden() -> None:
     """A firewall rule drops traffic to one peer, then to all: it is logged with reason and peers; without it, traffic
     resumes and arrives once."""
@@ -311,6 +335,11 @@ def link_of(daemon: RunningDaemon, peer: str) -> str | None:
         return next((found["link"] for found in client.request("peers")["peers"] if found["name"] == peer), None)
 
 
+def mtu_of(daemon: RunningDaemon, link: str) -> int | None:
+    with daemon.client() as client:
+        return next((found["mtu"] for found in client.request("status")["links"] if found["name"] == link), None)
+
+
 def under_way(daemon: RunningDaemon, fragments: int) -> None:
     """Waits until this many fragments were sent."""
 
@@ -334,6 +363,7 @@ SCENARIOS: dict[str, Callable[[], None]] = {
         interface_goes_in_the_middle,
         interface_created_again,
         interface_too_narrow,
+        interface_narrows_after_sending,
         sending_is_forbidden,
         interface_queue_overflows,
     )

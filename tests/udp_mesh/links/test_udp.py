@@ -37,6 +37,17 @@ def test_equal_sized_datagrams_are_sent_with_one_system_call(pair: tuple[UdpLink
     assert bob.system_calls < 41
 
 
+def test_probes_of_several_sizes_are_not_sent_as_one_run(pair: tuple[UdpLink, UdpLink]) -> None:
+    """A router that cannot pass the largest on drops the whole run, where it is not segmented before (IPv6 over veth or
+    virtio links): the smaller ones seemed to get lost as well."""
+    alice, bob = pair
+    to = bob.attachment.address
+    sizes = (1429, 1429, 1209, 505)
+    assert alice.send([Out(bytes(size), to, urgent=True) for size in sizes]) == len(sizes)
+    assert alice.system_calls == 3
+    assert [len(data) for data, _ in receive(bob, len(sizes))] == list(sizes)
+
+
 @settings(max_examples=15)
 @given(st.lists(st.tuples(st.sampled_from([1, 100, 1400]), st.booleans()), min_size=1, max_size=30))
 def test_any_mixture_arrives_in_order_with_and_without_segmentation(mixture: list[tuple[int, bool]]) -> None:
@@ -64,8 +75,8 @@ def test_long_runs_are_split_at_the_kernel_segment_limit(pair: tuple[UdpLink, Ud
 )
 def test_the_kernel_ignores_path_mtus_from_icmp(host: str, level: int, option: int) -> None:
     with closing(open_link(host, free_port())) as link, socket.socket(fileno=os.dup(link.fileno())) as own:
-        # IP_MTU_DISCOVER, IPV6_MTU_DISCOVER: IP_PMTUDISC_INTERFACE
-        assert own.getsockopt(level, option) == 4
+        # IP_MTU_DISCOVER, IPV6_MTU_DISCOVER: IP_PMTUDISC_OMIT
+        assert own.getsockopt(level, option) == 5
 
 
 def test_only_urgent_datagrams_carry_the_urgent_dscp(pair: tuple[UdpLink, UdpLink]) -> None:

@@ -156,7 +156,7 @@ class Reassembly:
                 self.forget(message_id)
                 return FragmentStatus.TOO_LARGE
             known = partial.head = head
-            partial.expires_at = min(partial.expires_at, expires_at)
+            partial.expires_at = expires_at
             if max(payloads, default=0) >= head.fragments:
                 self.forget(message_id)
                 return FragmentStatus.CORRUPT

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from udp_mesh.core.events import MessageId
 from udp_mesh.core.sender.message import AcceptedMessage, OutgoingMessage, TopicChannel
-from udp_mesh.core.sender.sent_packets import Packet, SendSnapshot, SentPackets
+from udp_mesh.core.sender.sent_packets import REORDER_PACKETS, Packet, SendSnapshot, SentPackets
 from udp_mesh.core.settings import Topic
 
 SNAPSHOT = SendSnapshot(0.0, 0, 0.0, 0.0, app_limited=False)
@@ -33,3 +33,53 @@ def test_a_run_continues_the_numbers_as_well() -> None:
     assert (sent.base, sent.next_number) == (5, 8)
     acknowledged, lost, _ = sent.acknowledge(6, 0b11)
     assert ([packet.position for packet in acknowledged], lost) == ([0, 1], [])
+
+
+def in_flight(count: int, *, urgent: bool = False) -> SentPackets:
+    """Packets 0 to count - 1, none of them acknowledged."""
+    sent = SentPackets()
+    for number in range(count):
+        sent.add(number, Packet(SNAPSHOT._replace(urgent=urgent), message(1), 0))
+    return sent
+
+
+def test_a_packet_called_lost_that_arrives_raises_the_reordering_threshold() -> None:
+    sent = in_flight(4)
+    _, lost, _ = sent.acknowledge(3, 0b0111)
+    assert (len(lost), sent.reorder_packets) == (1, REORDER_PACKETS)
+    acknowledged, _, late = sent.acknowledge(3, 0b1111)
+    assert (len(acknowledged), late, sent.spurious) == (1, None, 1)
+    assert sent.reorder_packets == REORDER_PACKETS + 1
+
+
+def test_an_acknowledgment_beyond_what_was_sent_revives_no_lost_packet() -> None:
+    sent = in_flight(4)
+    sent.acknowledge(3, 0b0111)
+    acknowledged, lost, newest = sent.acknowledge(4, 0b11111)
+    assert (acknowledged, lost, newest) == ([], [], None)
+
+
+def test_a_restart_forgets_what_was_lost_and_what_arrived() -> None:
+    """The numbers of the peer's earlier boot mean other packets now."""
+    sent = in_flight(10)
+    sent.acknowledge(9, 0b01_1111_1111)
+    sent.restart(0)
+    for number in range(3):
+        sent.add(number, Packet(SNAPSHOT, message(1), 0))
+    acknowledged, lost, _ = sent.acknowledge(2, 0b101)
+    assert (len(acknowledged), lost) == (2, [])
+
+
+def test_three_later_packets_prove_that_a_timed_out_one_is_lost() -> None:
+    sent = in_flight(6, urgent=True)
+    assert len(sent.declare_lost_before(0.0)) == 6
+    assert sent.confirm_timed_out(2, 0b011) == 0
+    assert sent.confirm_timed_out(3, 0b0111) == 1
+
+
+def test_an_outage_proves_no_loss() -> None:
+    sent = in_flight(2, urgent=True)
+    sent.declare_lost_before(0.0)
+    sent.add(2, Packet(SNAPSHOT, message(1), 0))
+    sent.abandon_all()
+    assert sent.confirm_timed_out(9, 0) == 0
