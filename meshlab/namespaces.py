@@ -1,12 +1,13 @@
 """System calls that Python does not offer: namespaces, mounts, and a seccomp filter.
 
-A fleet uses them in this order: `enter_user_namespace` (when not root), `clone` into new namespaces for each node,
-`mount`/`bind`/`pivot_root` inside it, `accept_setgroups`, and `setns` to enter a running node. Every function raises
-OSError with the kernel's errno. Numbers are from the kernel's uapi headers.
+A fleet uses them in this order: `enter_user_namespace` (when not root), `enter_quick_network`, `clone` into new
+namespaces for each node, `mount`/`bind`/`pivot_root` inside it, `accept_setgroups`, and `setns` to enter a running
+node. Every function raises OSError with the kernel's errno. Numbers are from the kernel's uapi headers.
 """
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import errno
 import os
@@ -42,6 +43,10 @@ _PR_SET_SECCOMP = 22
 _SECCOMP_MODE_FILTER = 2
 _SECCOMP_RET_ALLOW = 0x7FFF0000
 _SECCOMP_RET_ERRNO = 0x00050000
+
+# the size of the table of a network that a process of this one makes; a node has few connections
+_CHILD_TABLE = Path("/proc/sys/net/ipv4/tcp_child_ehash_entries")
+_TABLE_ENTRIES = 1024
 
 _libc = ctypes.CDLL(None, use_errno=True)
 
@@ -90,6 +95,18 @@ def clone(flags: int) -> int:
 
 def unshare(flags: int) -> None:
     _check(_libc.unshare(flags), "unshare")
+
+
+def enter_quick_network() -> int:
+    """Enter a new network whose own new networks have small tables of TCP connections; returns its descriptor.
+
+    All networks of a machine share one table, sized for its memory, and reading /proc/net/tcp searches all of it: 4 ms
+    with 24 GiB, and each dropbear reads it for its random numbers. Kernels before 6.1 have no other tables.
+    """
+    unshare(CLONE_NEWNET)
+    with contextlib.suppress(FileNotFoundError):
+        _CHILD_TABLE.write_text(f"{_TABLE_ENTRIES}\n", encoding="ascii")
+    return os.open("/proc/self/ns/net", os.O_RDONLY | os.O_CLOEXEC)
 
 
 def setns(descriptor: int, kind: int) -> None:

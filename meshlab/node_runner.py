@@ -63,9 +63,13 @@ class NodeRunner:
         self._attach_devices = attach_devices
         self._detach_devices = detach_devices
         self._selector = selectors.DefaultSelector()
+        # where nodes' networks are made; those with devices are made in the network that has the devices
+        self._network: int | None = None
         self._nodes: dict[str, _RunningNode] = {}
 
     def serve(self) -> None:
+        if self._attach_devices is None:
+            self._network = ns.enter_quick_network()
         self._selector.register(self._channel, selectors.EVENT_READ, None)
         while True:
             for key, _ in self._selector.select():
@@ -111,6 +115,9 @@ class NodeRunner:
         silence = os.open("/dev/null", os.O_RDONLY | os.O_CLOEXEC)
         report, report_end = os.pipe2(os.O_CLOEXEC)
         gate, gate_end = os.pipe2(os.O_CLOEXEC)
+        if self._network is not None:
+            # the last connection left this process in the network of its node
+            ns.setns(self._network, ns.CLONE_NEWNET)
         pid = ns.clone(FLAGS)
         if pid == 0:
             os.dup2(silence, 0)
