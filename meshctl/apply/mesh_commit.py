@@ -32,7 +32,15 @@ from meshctl.apply.change_in_progress import (
 )
 from meshctl.apply.commit_confirm import GRACE_AFTER_WINDOW_S, poll
 from meshctl.apply.context import NodeContext, RunContext
-from meshctl.apply.participant import Participant, canceled_because, cause_of, quorum_of, short_of_quorum, unmet_of
+from meshctl.apply.participant import (
+    Participant,
+    canceled_because,
+    cause_of,
+    entries_lost,
+    quorum_of,
+    short_of_quorum,
+    unmet_of,
+)
 from meshctl.device.errors import NodeRefused
 from meshctl.device.openwrt import measure_uptime
 from meshctl.device.ssh import SshConnection
@@ -243,9 +251,8 @@ def _decide(commit: _MeshCommit, needed: Mapping[str, int]) -> dict[str, Outcome
             break
         _notify_unreachable(commit, proven)
         backoff.pause()
-    lost = [each.name for each in commit.participants if each.name in commit.entries and each not in proven]
-    named = "the base" if len(commit.entries) == 1 else ", ".join(lost)
-    why = f"{named} did not come back" if lost else short_of_quorum(proven, needed, commit.success)
+    lost = [each for each in commit.participants if each.name in commit.entries and each not in proven]
+    why = entries_lost(lost, commit.entries) if lost else short_of_quorum(proven, needed, commit.success)
     if not why:
         return _confirm_all(commit)
     if commit.run.interrupt.leaving:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from meshctl.apply.change_in_progress import ChangeInProgress
@@ -83,6 +83,14 @@ def short_of_quorum(proven: Iterable[Participant], needed: Mapping[str, int], su
     there = Counter(mesh for participant in proven for mesh in participant.meshes)
     short = {mesh: count for mesh, count in needed.items() if there[mesh] < count}
     return "; ".join(f"{there[mesh]} of mesh {mesh} {success}, {count} required" for mesh, count in short.items())
+
+
+def entries_lost(lost: Sequence[Participant], entries: Sequence[str]) -> str:
+    """`the base did not come back`: why a change fails in which entry nodes have not proven themselves."""
+    named = "the base" if len(entries) == 1 else ", ".join(participant.name for participant in lost)
+    if any(participant.is_unreachable for participant in lost):
+        return f"{named} did not come back"
+    return f"{named} did not pass {'its' if len(lost) == 1 else 'their'} checks"
 
 
 def unmet_of(participant: Participant) -> str:

@@ -16,7 +16,7 @@ from meshctl.apply.change_in_progress import ChangeInProgress
 from meshctl.apply.context import NodeContext, RunContext
 from meshctl.apply.mesh_commit import _MeshCommit, commit_mesh
 from meshctl.apply.next_action import Action
-from meshctl.apply.participant import Participant, canceled_because, quorum_of, short_of_quorum
+from meshctl.apply.participant import Participant, canceled_because, entries_lost, quorum_of, short_of_quorum
 from meshctl.device.errors import NodeRefused
 from meshctl.device.observation import ChangeStatus, Observation
 from meshctl.device.openwrt import UptimeSample
@@ -255,6 +255,18 @@ class TestMoment:
             assert mesh_commit._lead_s(one_after_the_other) == 24.0
             assert mesh_commit._lead_s(replace(one_after_the_other, parallel=2)) == 12.0
             assert mesh_commit._lead_s(replace(one_after_the_other, participants=participants[:1])) == 2.0
+
+
+def test_an_entry_node_that_answers_but_fails_its_checks_is_not_said_to_be_away() -> None:
+    """Seen on real OpenWrt: the base answered, and heard no neighbor."""
+    heard, away = (
+        Participant(cast("NodeContext", SimpleNamespace(name=name)), is_unreachable=name == "b02")
+        for name in ("b01", "b02")
+    )
+    assert entries_lost([heard], ["b01"]) == "the base did not pass its checks"
+    assert entries_lost([away], ["b02"]) == "the base did not come back"
+    assert entries_lost([heard], ["b01", "b02"]) == "b01 did not pass its checks"
+    assert entries_lost([heard, away], ["b01", "b02"]) == "b01, b02 did not come back"
 
 
 @pytest.mark.parametrize(

@@ -101,7 +101,7 @@ def test_too_many_failed_checks_roll_all_nodes_back(rig: Rig) -> None:
     assert ended.results == of_all(rig, "rolled back"), ended.out + ended.err
     # the base, which hears one of four neighbors, fails as well
     assert ended.events[-1]["outcomes"][0]["reason"].startswith(
-        "all nodes were rolled back: the base did not come back"
+        "all nodes were rolled back: the base did not pass its checks"
     )
     assert states(rig, old, new) == of_all(rig, "old")
     rig.current = old
