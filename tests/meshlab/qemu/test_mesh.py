@@ -93,8 +93,9 @@ def test_topology_matches_the_kernel_neighbor_tables(lab: Lab) -> None:
 
 
 def _topology_of_one_moment(lab: Lab) -> Any:
-    """The topology of meshctl. Its links match the kernels' neighbor tables just after, and each node's hops match their
-    routes just before or just after. On a starved host a node may not answer in time."""
+    """The topology of meshctl. Its links match the kernels' neighbor tables just after, each node's hops their routes
+    just before or just after. On a starved host a node may not answer in time.
+    """
     drawn: Any = None
 
     def agrees() -> bool:
