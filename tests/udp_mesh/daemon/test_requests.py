@@ -52,11 +52,11 @@ def test_an_invalid_name_is_rejected_and_later_messages_are_delivered(
 @pytest.mark.parametrize(
     ("fields", "complaint"),
     [
-        ({"address": "bob"}, "neighbour.address: expected an IP address"),
+        ({"address": "bob"}, "neighbor.address: expected an IP address"),
         ({"address": "fe80::1"}, 'expected link = "INTERFACE" with a link-local address'),
         ({"address": "fd00::1", "name": "x", "legacy": True}, "expected an IPv4 address"),
         ({"address": "10.0.0.1", "legacy": True}, "expected a name"),
-        ({"address": "10.0.0.1", "name": "a b"}, "neighbour.name: expected a name of 1 to 63 bytes"),
+        ({"address": "10.0.0.1", "name": "a b"}, "neighbor.name: expected a name of 1 to 63 bytes"),
     ],
 )
 def test_a_neighbor_invalid_in_the_configuration_file_cannot_be_set(
@@ -64,7 +64,7 @@ def test_a_neighbor_invalid_in_the_configuration_file_cannot_be_set(
 ) -> None:
     with pair[0].client() as client:
         with pytest.raises(MeshError) as refused:
-            client.request("set-neighbour", **fields)
+            client.request("set-neighbor", **fields)
         assert refused.value.code == "bad-request"
         assert complaint in str(refused.value)
         assert len(client.request("neighbours")["neighbours"]) == 1
