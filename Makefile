@@ -15,11 +15,10 @@ demo: setup
 
 # The tests start the programs hundreds of times, and each worker imports all tests: with PYTHONDONTWRITEBYTECODE each
 # would compile them.
-# Five workers on two cores: tests of virtual fleets and of real radios wait for most of their time. With four, the cores
-# are idle for a twelfth of the run.
+# Four workers on two cores: tests of virtual fleets and of real radios wait for most of their time.
 test: setup
 	$(BIN)/python -m compileall -q meshctl meshlab mesh_sweep udp_mesh
-	env -u PYTHONDONTWRITEBYTECODE $(BIN)/pytest -n 5 --dist loadgroup --no-loadscope-reorder
+	env -u PYTHONDONTWRITEBYTECODE $(BIN)/pytest -n 4 --dist loadgroup --no-loadscope-reorder
 
 check: setup
 	$(BIN)/ruff check .
