@@ -33,21 +33,16 @@ SUBTARGETS: Mapping[str, frozenset[str]] = MappingProxyType(
         "x86": _words("64 generic geode legacy"),
     }
 )
-# device tree paths of built-in radios, which exist only on boards of this target
+# device tree paths of built-in radios, which exist only on boards of this target, and their driver where its limits are
+# known
 _CHIPS = (
-    (re.compile(r"platform/ahb/.*\.wmac"), "ath79"),
-    (re.compile(r"platform/(ar9\w+|qca9\w+)_wmac"), "ar71xx"),
-    (re.compile(r"platform/10(18|30)0000\.wmac"), "ramips"),
-    (re.compile(r"platform/(soc/)?18000000\.(wmac|wifi)"), "mediatek"),
-    (re.compile(r"platform/soc/a[08]00000\.wifi"), "ipq40xx"),
-    (re.compile(r"platform/soc@0/c000000\.wifi"), "qualcommax"),
-)
-# and the driver of those radios, for what it supports
-_CHIP_DRIVERS = (
-    (re.compile(r"platform/ahb/.*\.wmac|platform/(ar9\w+|qca9\w+)_wmac"), "ath9k"),
-    (re.compile(r"platform/10180000\.wmac"), "rt2800-soc"),
-    (re.compile(r"platform/10300000\.wmac"), "mt7603"),
-    (re.compile(r"platform/soc/a[08]00000\.wifi"), "ath10k-ct"),
+    (re.compile(r"platform/ahb/.*\.wmac"), "ath79", "ath9k"),
+    (re.compile(r"platform/(ar9\w+|qca9\w+)_wmac"), "ar71xx", "ath9k"),
+    (re.compile(r"platform/10180000\.wmac"), "ramips", "rt2800-soc"),
+    (re.compile(r"platform/10300000\.wmac"), "ramips", "mt7603"),
+    (re.compile(r"platform/(soc/)?18000000\.(wmac|wifi)"), "mediatek", ""),
+    (re.compile(r"platform/soc/a[08]00000\.wifi"), "ipq40xx", "ath10k-ct"),
+    (re.compile(r"platform/soc@0/c000000\.wifi"), "qualcommax", ""),
 )
 _RADIO_PATHS = _words(
     """platform/ahb/18100000.wmac platform/ar933x_wmac platform/ar934x_wmac platform/qca953x_wmac platform/qca955x_wmac
@@ -69,12 +64,12 @@ _MIN_LETTERS = 6
 
 def chip_target(radio_path: str) -> str | None:
     """The only target with a radio at this path; None if any target may have it (PCI, USB)."""
-    return next((target for pattern, target in _CHIPS if pattern.fullmatch(radio_path)), None)
+    return next((target for pattern, target, _ in _CHIPS if pattern.fullmatch(radio_path)), None)
 
 
 def chip_driver(radio_path: str) -> str:
-    """The driver of a built-in radio at this path; empty if the path does not tell (PCI, USB)."""
-    return next((driver for pattern, driver in _CHIP_DRIVERS if pattern.fullmatch(radio_path)), "")
+    """The driver of a built-in radio at this path; empty if it is unknown (PCI, USB)."""
+    return next((driver for pattern, _, driver in _CHIPS if pattern.fullmatch(radio_path)), "")
 
 
 def similar_radio_paths(path: str) -> tuple[str, ...]:

@@ -83,7 +83,15 @@ def _rendered(fleet: Fleet) -> Iterator[tuple[Node, Outcome]]:
             yield node, error
 
 
+def has_own_templates(fleet: Fleet) -> bool:
+    """Whether the fleet's templates may add anything to what meshctl renders."""
+    return (Path(fleet.base) / "templates").is_dir()
+
+
 def _holds_own_text(fleet: Fleet, node: Node) -> bool:
     """Whether the node uses templates or options of the operator; the shipped templates are tested with meshctl."""
-    own_templates = (Path(fleet.base) / "templates").is_dir()
-    return own_templates or bool(node.extra_uci) or any(fleet.meshes[m].operator_parts.templates for m in node.meshes)
+    return (
+        has_own_templates(fleet)
+        or bool(node.extra_uci)
+        or any(fleet.meshes[m].operator_parts.templates for m in node.meshes)
+    )

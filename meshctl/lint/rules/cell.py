@@ -15,7 +15,7 @@ from meshctl.wording import join_limited
 
 # IEEE 802.11: the basic rates of 802.11b, and the OFDM rates of 802.11a and g
 _DSSS_KBPS = (1000, 2000, 5500, 11000)
-_OFDM_KBPS = (6000, 9000, 12000, 18000, 24000, 36000, 48000, 54000)
+OFDM_KBPS = (6000, 9000, 12000, 18000, 24000, 36000, 48000, 54000)
 # IEEE 802.11-2020 9.4.2.2: an SSID has 0 to 32 octets
 _MAX_SSID_BYTES = 32
 _SECOND_MESH = """
@@ -31,7 +31,8 @@ _SECOND_MESH = """
     """
 
 
-def _second(ssid: str, bssid: str, channel: int) -> str:
+def second_mesh(ssid: str, bssid: str, channel: int) -> str:
+    """The example of a fleet with a mesh of another network beside the first one."""
     return _SECOND_MESH.replace("BSSID", bssid).replace("SSID", ssid).replace("CHANNEL", str(channel))
 
 
@@ -92,8 +93,8 @@ def bssid_missing(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     why="""With the same BSSID, or the same SSID on one channel, the radios of both meshes join one cell with two sets
     of routing messages. Meshes at different sites do not hear each other.""",
     fix="Give each mesh a unique SSID and BSSID, or set the `site` of their nodes.",
-    failing=_second("other", "02:ca:fe:00:00:01", 11),
-    passing=_second("other", "02:ca:fe:00:00:02", 11),
+    failing=second_mesh("other", "02:ca:fe:00:00:01", 11),
+    passing=second_mesh("other", "02:ca:fe:00:00:02", 11),
 )
 def cell_shared(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     reported: set[str] = set()
@@ -130,8 +131,8 @@ def meshes_in_earshot(fleet: Fleet) -> list[list[Mesh]]:
     why="""Cells on overlapping channels cannot coordinate as they would on the same channel: each sees the other as
     noise and loses airtime. Meshes at different sites do not hear each other.""",
     fix="Use non-overlapping channels (1, 6 and 11 at 2.4 GHz), or another band; or set the `site` of their nodes.",
-    failing=_second("other", "02:ca:fe:00:00:02", 9),
-    passing=_second("other", "02:ca:fe:00:00:02", 11),
+    failing=second_mesh("other", "02:ca:fe:00:00:02", 9),
+    passing=second_mesh("other", "02:ca:fe:00:00:02", 11),
 )
 def cells_overlap(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     reported: set[str] = set()
@@ -325,10 +326,9 @@ def adhoc_on_19_07(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
 )
 def broadcast_rate_invalid(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for mesh in fleet.meshes.values():
-        rates = _OFDM_KBPS if mesh.band is Band.G5 else tuple(sorted(_DSSS_KBPS + _OFDM_KBPS))
+        rates = OFDM_KBPS if mesh.band is Band.G5 else tuple(sorted(_DSSS_KBPS + OFDM_KBPS))
         if mesh.mcast_rate_kbps not in rates:
-            expected = f"one of {', '.join(map(str, rates))}"
-            path = ("meshes", mesh.name, "mcast_rate_kbps")
+            path, expected = ("meshes", mesh.name, "mcast_rate_kbps"), f"one of {', '.join(map(str, rates))}"
             yield Finding(path, "not a rate of this band", expected, str(mesh.mcast_rate_kbps))
 
 
@@ -344,7 +344,7 @@ def broadcast_rate_invalid(fleet: Fleet, _context: LintContext) -> Iterator[Find
 )
 def broadcast_rate_low(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for mesh in fleet.meshes.values():
-        if mesh.mcast_rate_kbps in _DSSS_KBPS and mesh.band is Band.G2 and mesh.mcast_rate_kbps < _OFDM_KBPS[0]:
+        if mesh.mcast_rate_kbps in _DSSS_KBPS and mesh.band is Band.G2 and mesh.mcast_rate_kbps < OFDM_KBPS[0]:
             path = ("meshes", mesh.name, "mcast_rate_kbps")
             yield Finding(path, "favors long weak links", "at least 6000", str(mesh.mcast_rate_kbps))
 

@@ -29,16 +29,17 @@ _IMAGE = 'image for {"supported_devices":["ubnt,rocket-m"],"version":{"version":
 
 def format_channels(channels: tuple[int, ...]) -> str:
     """`one of 1-11`, `one of 36, 40, 44, 48`."""
-    if not channels:
-        return "another band"
+    return f"one of {_listed(channels)}" if channels else "another band"
+
+
+def _listed(channels: tuple[int, ...]) -> str:
     run = range(channels[0], channels[-1] + 1)
-    shown = f"{channels[0]}-{channels[-1]}" if channels == tuple(run) else ", ".join(map(str, channels))
-    return f"one of {shown}"
+    return f"{channels[0]}-{channels[-1]}" if channels == tuple(run) else ", ".join(map(str, channels))
 
 
 def channel_or_width(channels: tuple[int, ...]) -> str:
     """What to choose where a channel may not be so wide: one of those that may, if there are any."""
-    return f"a channel of {format_channels(channels).removeprefix('one of ')}" if channels else "a narrower htmode"
+    return f"a channel of {_listed(channels)}" if channels else "a narrower htmode"
 
 
 def _country(fleet: Fleet, context: LintContext) -> Country | None:
@@ -101,9 +102,8 @@ def channel_unknown(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
         if mesh.channel not in CHANNELS[mesh.band]:
             legal = initiating_channels(country, mesh.band)
             path = ("meshes", mesh.name, "channel")
-            yield Finding(
-                path, f"not a channel of the {mesh.band.value} band", format_channels(legal), str(mesh.channel)
-            )
+            message = f"not a channel of the {mesh.band.value} band"
+            yield Finding(path, message, format_channels(legal), str(mesh.channel))
 
 
 @fleet_rule(
@@ -251,8 +251,8 @@ def width_illegal(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
             continue
         legal = legal_channels(country, mesh.band, mesh.htmode, forbidden=NO_INITIATE)
         expected = channel_or_width(legal) + (f" (country {country.alpha2})" if legal else "")
-        path = ("meshes", mesh.name, "htmode")
-        yield Finding(path, f"channel {mesh.channel} may not be {width} MHz wide", expected, mesh.htmode)
+        message = f"channel {mesh.channel} may not be {width} MHz wide"
+        yield Finding(("meshes", mesh.name, "htmode"), message, expected, mesh.htmode)
 
 
 @fleet_rule(

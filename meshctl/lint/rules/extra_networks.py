@@ -68,9 +68,7 @@ def address_ranges(node: Node, dhcp: Package | None) -> Iterator[tuple[str, Sect
         is_ignored = is_on(section, "ignore") and (
             f"dhcp.{section.name}.ignore" in node.extra_uci or not _is_range(section)
         )
-        is_ipv6_only = any(section.get(option) == "server" for option in ("ra", "dhcpv6")) and not (
-            section.get("start") or section.get("limit") or section.get("dhcpv4") == "server"
-        )
+        is_ipv6_only = any(section.get(option) == "server" for option in ("ra", "dhcpv6")) and not _is_range(section)
         if given and not is_ignored and not is_ipv6_only:
             yield given[0], section
 

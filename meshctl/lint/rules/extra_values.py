@@ -43,7 +43,7 @@ def _meant(value: str, words: tuple[str, ...]) -> tuple[str, ...]:
     """The words that a value probably means: with a typo, in other letters, or its first half (`forward`)."""
     lower = value.lower()
     cut = tuple(word for word in words if word.startswith(lower) and 2 * len(lower) >= len(word))
-    return () if value in words else one_edit_apart(value, words) or cut
+    return one_edit_apart(value, words) or cut
 
 
 def _number(least: int, most: int) -> _Check:

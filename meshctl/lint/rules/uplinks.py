@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
 
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
 from meshctl.lint.rule import Finding, fleet_rule
+from meshctl.lint.trial_rendering import has_own_templates
 from meshctl.model import Fleet, Node
 from meshctl.model.ip import IpAddress
 
@@ -27,8 +27,7 @@ from meshctl.model.ip import IpAddress
     """,
 )
 def gateway_without_uplink(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    if (Path(fleet.base) / "templates").is_dir():
-        # templates of the fleet may add any interface
+    if has_own_templates(fleet):
         return
     radios: dict[IpAddress, Node] = {node.address.ip: node for node in fleet.managed()}
     for node in fleet.managed():
