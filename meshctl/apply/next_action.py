@@ -97,6 +97,12 @@ REASONS = {
 }
 
 
+def reason_text(last_reason: str) -> str:
+    """The switch's reason in words, without what follows a `+`."""
+    word = last_reason.partition("+")[0]
+    return REASONS.get(word, word)
+
+
 def rollback_reason(
     status: ChangeStatus, unmet: Sequence[str], login_refused: str = "", connect_error: str = ""
 ) -> str:
@@ -105,7 +111,7 @@ def rollback_reason(
 
     An abort is sent because of `unmet`, and what a login says later is its effect: the restored keys are not ours."""
     word, _, rest = status.last_reason.partition("+")
-    reason = REASONS.get(word, word or "for an unknown reason")
+    reason = reason_text(word) or "for an unknown reason"
     if rest:
         reason += ", and the packages it installed could not be removed"
     if word in NOT_IN_FORCE:

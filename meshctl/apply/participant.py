@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from meshctl.apply.change_in_progress import ChangeInProgress
 from meshctl.apply.context import NodeContext
-from meshctl.apply.next_action import REASONS, Action
+from meshctl.apply.next_action import Action, reason_text
 from meshctl.device.openwrt import UptimeSample
 from meshctl.fleet import Outcome
 
@@ -108,5 +108,5 @@ def cause_of(participant: Participant) -> str:
     change = participant.change
     if change is None or change.status.last_id != change.id or change.status.last_outcome != "restored":
         return ""
-    word = change.status.last_reason.partition("+")[0]
-    return "" if word in ("abort", "timeout") else f"{participant.name}: {REASONS.get(word, word)}"
+    is_common = change.status.last_reason.partition("+")[0] in ("abort", "timeout")
+    return "" if is_common else f"{participant.name}: {reason_text(change.status.last_reason)}"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from meshctl.apply.mesh_commit import LEFT_BEHIND
-from meshctl.apply.next_action import REASONS
+from meshctl.apply.next_action import reason_text
 from meshctl.apply.prepare import Prepared
 from meshctl.device.observation import ChangeStatus
 from meshctl.fleet import Outcome, Result
@@ -37,7 +37,7 @@ def resolutions(run_id: int, earlier: Iterable[Outcome], now: Prepared) -> dict[
 def _why(change: ChangeStatus | None) -> str:
     if change is None or change.last_outcome != "restored":
         return ""
-    return f" ({REASONS.get(change.last_reason, change.last_reason)})"
+    return f" ({reason_text(change.last_reason)})"
 
 
 def _left(outcome: Outcome) -> str:
