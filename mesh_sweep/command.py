@@ -85,13 +85,11 @@ def sweep(study: Study, options: SweepOptions, short: dict[str, str]) -> int:
         if len(missing) < len(cases):
             _note(f"{out}: {len(cases) - len(missing)} of {len(cases)} cases have a result already")
         progress = _Progress(len(missing))
-        is_checked = False
         try:
             for result in run_cases(missing, study.run, workers, progress.show):
                 file.append(result)
                 results[result.case] = result
-                if not is_checked and not result.failed:
-                    is_checked = True
+                if not result.failed and progress.done == progress.failed:
                     _warn_of_unknown_figures(result, options.figures, goals, progress)
                 progress.add(result)
         except KeyboardInterrupt:
