@@ -276,9 +276,9 @@ class UdpLink:
         while end < limit:
             following = datagrams[end]
             length = len(following.data)
-            if following.destination != destination or following.urgent != urgent or length > size:
+            if following.destination != destination or following.urgent != urgent:
                 break
-            if urgent and length < size:
+            if length > size or (urgent and length != size):
                 break
             end += 1
             if length < size:
