@@ -143,7 +143,7 @@ COPIES = st.lists(st.tuples(st.sampled_from(PEERS), st.integers(0, 5)), max_size
 
 @given(COPIES, st.randoms())
 def test_the_counts_are_those_of_all_copies_added_up(copies: list[tuple[str, int]], rng: random.Random) -> None:
-    """Each copy is added once and removed once, in any order; after each step everything is counted anew."""
+    """Each copy is added once and removed once, in any order; after each step all of them are counted."""
     channel = TopicChannel(0, TOPICS[1], "map", "")
     payloads = [bytes(1000 + number) for number in range(6)]
     bodies = [payload if number % 2 else payload[:100] for number, payload in enumerate(payloads)]
