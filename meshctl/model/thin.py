@@ -1,4 +1,4 @@
-"""Thin links: radios of 1 to 100 kbit/s on robots' serial ports, for a few topics when wifi is gone."""
+"""Thin links: radios of 1 to 100 kbit/s on robots' serial ports, for a few topics where Wi-Fi does not reach."""
 
 from __future__ import annotations
 
