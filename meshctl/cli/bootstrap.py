@@ -197,7 +197,7 @@ def replace(
         typer.Option(
             "--at",
             metavar="HOST",
-            help="Address of the new device if not its own: HOST or HOST:PORT; in a lab a virtual node.",
+            help="Address of the new device, if it is not the spare's own: HOST or HOST:PORT; in a lab a virtual node.",
         ),
     ] = "",
     interface: Annotated[
@@ -219,7 +219,7 @@ def replace(
     key: KeyFiles = None,
     lab: Lab = None,
 ) -> None:
-    """Replace a failed node: the new device gets its name, address and role, the inventory the new MAC and label.
+    """Replace a failed node: the new device gets its name, address and role; its MAC and label go into the inventory.
 
     Example: meshctl replace husky1-b03 spare2
     """

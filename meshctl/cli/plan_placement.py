@@ -52,7 +52,7 @@ def plan_placement(
 
     The route begins at the base. On an occupancy map, the way between two points leads through free space.
 
-    Exit code: 0 the whole route has the margin, 1 not all of it has, 2 could not run.
+    Exit code: 0 the whole route has the margin, 1 part of it does not, 2 could not run.
 
     Example: meshctl plan-placement ground.yaml base 240,0 240,-60 --svg plan.svg
 

@@ -94,9 +94,10 @@ def install_command(
     key: KeyFiles = None,
     lab: Lab = None,
 ) -> None:
-    """Install or update meshctl on the gateways, give each a key of its own, and write that key into the inventory.
+    """Install or update meshctl on the gateways, generate a key on each, and write its public part into the inventory.
 
-    Needs Python 3.11 there, and neither root nor the internet. Only the operators in the inventory may give orders.
+    The gateways need Python 3.11, but neither root nor internet access. Only the operators in the inventory may give
+    orders.
 
     Example: meshctl sites install north --wheels wheels/
     """

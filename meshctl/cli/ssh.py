@@ -52,7 +52,7 @@ def trust(
 ) -> None:
     """Show the nodes' host key fingerprints and pin them in the fleet's known_hosts after confirmation.
 
-    Exit code: 0 if all keys are pinned (with --dry-run: or would be), 1 if not, 3 if no node answers.
+    Exit code: 0 if all keys are pinned (with --dry-run: would be), 1 if not, 3 if no node answers.
 
     Example: meshctl trust b03
     """

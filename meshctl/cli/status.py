@@ -64,7 +64,7 @@ def status(
     wide: Annotated[bool, typer.Option("--wide", help="Show all columns regardless of the terminal width.")] = False,
     as_json: AsJson = False,
     answers: Annotated[
-        bool, typer.Option("--answers", hidden=True, help="Print what the radios say, for another meshctl to read.")
+        bool, typer.Option("--answers", hidden=True, help="Print the radios' raw answers, for another meshctl to read.")
     ] = False,
 ) -> None:
     """Show the state of every radio and robot: reachability, drift from the inventory, neighbors and alarms.
