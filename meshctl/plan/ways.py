@@ -139,7 +139,7 @@ def _recommended(rolling: Way, at_once: Way) -> tuple[Way, Way]:
         return rolling, replace(at_once, reason=reason)
     if saved_s > LONG_S:
         return rolling, replace(at_once, reason=f"it takes {saved_s / 60:.0f} minutes less")
-    return replace(rolling, reason="a fault shows on few nodes, and the others go on working"), at_once
+    return replace(rolling, reason="a fault shows on few nodes, and the others keep working"), at_once
 
 
 def _times(count: int) -> str:

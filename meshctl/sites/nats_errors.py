@@ -11,7 +11,7 @@ HINT = "check the address, the credentials and the network; `nats.url` in the in
 # on disk, of its account), and a message could not be stored.
 _NO_ROOM = (10002, 10023, 10028, 10047, 10077)
 _ROOM_HINT = (
-    "make room on the disk of the NATS server, or raise its `max_file_store`; it sets 100 MB aside for each site"
+    "make room on the disk of the NATS server, or raise its `max_file_store`; it reserves 100 MB for each site"
 )
 
 
@@ -31,7 +31,7 @@ def translated(error: BaseException, url: str) -> Unreachable | None:
 
     match error:
         case NoRespondersError():
-            return NatsLost(f"NATS server {url}: no one listens")
+            return NatsLost(f"NATS server {url}: connection refused")
         case APIError() if error.err_code in _NO_ROOM:
             return NatsLost(f"NATS server {url} has no room: {error.description}", hint=_ROOM_HINT)
         case APIError():

@@ -74,7 +74,7 @@ class Order:
                 hint="plan and order it again",
             )
         if now_s < self.signed_s - MAX_CLOCK_DIFFERENCE_S:
-            raise ClockBehind(f"the clock here says {_moment(now_s)}, and the order is of {_moment(self.signed_s)}")
+            raise ClockBehind(f"the clock here says {_moment(now_s)}, the order was signed at {_moment(self.signed_s)}")
 
 
 @dataclass(frozen=True, slots=True)

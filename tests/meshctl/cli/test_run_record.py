@@ -20,7 +20,7 @@ from tests.meshctl.inventory.inventories import HEAD
         (("f", ""), ("f", "/lab"), "one of the real fleet, and $MESHCTL_LAB or --lab names the lab in /lab", "unset"),
         (("f", "/lab"), ("f", ""), "one of the lab in /lab", "add `--lab /lab`"),
         (("f", "/lab"), ("f", "/other"), "one of the lab in /lab", "add `--lab /lab`"),
-        (("g", ""), ("f", ""), "one of fleet g: expected one of fleet f", ""),
+        (("g", ""), ("f", ""), "belongs to fleet g, not to f", ""),
     ],
 )
 def test_a_run_of_another_fleet_is_refused_by_its_fleet(

@@ -311,7 +311,7 @@ def _master_problem() -> str:
     """Why there is no master to connect to; "" if there is one."""
     if rosgraph.is_master_online():
         return ""
-    return "none answers at ROS_MASTER_URI={}".format(rosgraph.get_master_uri())
+    return "no answer at ROS_MASTER_URI={}".format(rosgraph.get_master_uri())
 
 
 def _wait_for(problem: Callable[[], str], what: str) -> None:
