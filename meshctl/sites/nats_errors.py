@@ -31,7 +31,7 @@ def translated(error: BaseException, url: str) -> Unreachable | None:
 
     match error:
         case NoRespondersError():
-            return NatsLost(f"NATS server {url}: connection refused")
+            return NatsLost(f"NATS server {url}: no responders")
         case APIError() if error.err_code in _NO_ROOM:
             return NatsLost(f"NATS server {url} has no room: {error.description}", hint=_ROOM_HINT)
         case APIError():
