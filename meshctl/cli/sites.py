@@ -17,7 +17,7 @@ import typer
 from meshctl import __version__
 from meshctl.cli.context import AsJson, DryRun, InventoryPath, KeyFiles, Lab, Session, session
 from meshctl.cli.output import echo, echo_json
-from meshctl.cli.site_status import as_object, exit_code, look, show
+from meshctl.cli.site_status import as_object, exit_code, query_sites, show
 from meshctl.device.errors import AuthenticationRefused
 from meshctl.device.trust import AcceptAnyKey, HostKey
 from meshctl.device.upload import UploadProgress
@@ -74,7 +74,7 @@ def status_command(
     Example: meshctl sites status --nodes
     """
     with session(inventory, key_files=key or (), lab=lab) as opened:
-        found = look(opened, inventory, selected_sites(opened, sites), with_nodes=nodes)
+        found = query_sites(opened, inventory, selected_sites(opened, sites), with_nodes=nodes)
     if as_json:
         echo_json(json.dumps([as_object(each) for each in found], indent=1))
     else:

@@ -134,8 +134,8 @@ def plan_deploy(host: Host, robot: str, options: DeployOptions) -> tuple[HostFac
 
 def _unmet_for_port(host: Host, robot: str, options: DeployOptions, old: int) -> list[tuple[str, str]]:
     """A daemon on a new port does not hear peers that are still on the old one, and would be rolled back for that."""
-    seen = collect_facts(host, robot, expected_release(options.fleet, robot, options.secrets), now_s=options.now_s())
-    if not (left := sorted(options.apart & set(seen.online))):
+    facts = collect_facts(host, robot, expected_release(options.fleet, robot, options.secrets), now_s=options.now_s())
+    if not (left := sorted(options.apart & set(facts.online))):
         return []
     count = sum(other.computer is not None for other in options.fleet.robots.values())
     port = options.fleet.udp_mesh.port
