@@ -73,10 +73,10 @@ def ways_of(
         _rolling_risk(in_order, plans),
     )
     count = len(simultaneous.nodes)
-    cuts = [plans[name].cut > Cut.LOGIN for name in simultaneous.nodes]
+    is_interrupted = [plans[name].cut > Cut.LOGIN for name in simultaneous.nodes]
     lost = (
-        "all of them are interrupted at the same moment, once" if all(cuts) else
-        f"{sum(cuts)} of them are interrupted at the same moment, once" if any(cuts) else "interrupts nothing"
+        "all of them are interrupted at the same moment, once" if all(is_interrupted) else
+        f"{sum(is_interrupted)} of them are interrupted at the same moment, once" if any(is_interrupted) else "interrupts nothing"
     )  # fmt: skip
     at_once = Way(
         TOGETHER,
