@@ -89,8 +89,8 @@ def entries_of(device: ExistingDevice, fleet: Fleet | None, options: ImportOptio
     node: dict[str, Value] = {"groups": list(options.groups)} if options.groups else {}
     node["hardware"] = hardware
     meshes = _meshes(draft, radios, address, routed_port(device, radios, lan))
-    holding = _holding(meshes, draft, address)
-    node["address"] = str(address.ip) if holding else str(address)
+    is_in_mesh_network = _is_in_mesh_network(meshes, draft, address)
+    node["address"] = str(address.ip) if is_in_mesh_network else str(address)
     node.update(_identity(draft, name))
     node.update(_wired(draft, profile, radios, lan, backbone))
     if radios:
@@ -208,7 +208,7 @@ def _known_mesh(fleet: Fleet | None, radio: ExistingRadio) -> Mesh | None:
     return max(alike, key=lambda mesh: (str(mesh.channel) == cell[0]) + (mesh.bssid == cell[1]), default=None)
 
 
-def _holding(meshes: Mapping[str, str], draft: _Draft, address: IpInterface) -> bool:
+def _is_in_mesh_network(meshes: Mapping[str, str], draft: _Draft, address: IpInterface) -> bool:
     """Whether the prefix length of the address follows from a mesh, so that the entry needs none."""
     new = (value for path, value in draft.values.items() if path[0] == "meshes")
     networks = [str(value["network"]) for value in new if isinstance(value, Mapping)]

@@ -15,7 +15,7 @@ from meshctl.errors import MeshctlError, NodeError
 from meshctl.fleet import Outcome, Result
 from meshctl.fleet.journal import Journal, default_path
 from meshctl.fleet.journal_schema import SCHEMA
-from meshctl.fleet.process import process_lives, this_process
+from meshctl.fleet.process import is_process_alive, this_process
 from meshctl.fleet.sqlite_file import SqliteFile
 
 
@@ -164,9 +164,9 @@ def test_the_journal_is_located_in_the_xdg_state_directory() -> None:
 
 def test_a_reused_pid_is_not_mistaken_for_the_original_process() -> None:
     own = this_process()
-    assert process_lives(own)
-    assert not process_lives(own + "1")
-    assert process_lives("elsewhere:1:1")
+    assert is_process_alive(own)
+    assert not is_process_alive(own + "1")
+    assert is_process_alive("elsewhere:1:1")
 
 
 def test_an_unwritable_journal_is_reported_without_stopping_the_run(path: Path) -> None:
