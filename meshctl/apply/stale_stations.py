@@ -29,7 +29,7 @@ from meshctl.device.observation import Observation
 from meshctl.device.scripts import script
 from meshctl.model import Node
 from meshctl.plan.radios import EVERY_RADIO, SLACK_S, Radios
-from meshctl.topology import NEIGHBOUR_FRESH_MS, mesh_macs
+from meshctl.topology import NEIGHBOR_FRESH_MS, mesh_macs
 
 # Neighbors are queried repeatedly while the node is unreachable, because an entry is stale only once the radio is back
 # on the air. The pause doubles each time, up to a minute: Linux drops an inactive station of an ad-hoc cell after that
@@ -166,9 +166,9 @@ def current_neighbors(observation: Observation, names: Mapping[str, str]) -> tup
 
 def _heard_macs(observation: Observation) -> frozenset[str]:
     fresh = (
-        neighbour.mac.lower()
-        for neighbour in observation.neighbours or ()
-        if neighbour.last_seen_ms <= NEIGHBOUR_FRESH_MS
+        neighbor.mac.lower()
+        for neighbor in observation.neighbors or ()
+        if neighbor.last_seen_ms <= NEIGHBOR_FRESH_MS
     )
     return frozenset((*fresh, *(station.mac.lower() for station in observation.stations or ())))
 

@@ -33,7 +33,7 @@ def test_every_node_of_a_run_is_pending_until_it_has_an_outcome(path: Path) -> N
     with Journal(path) as journal:
         run = journal.begin("provision", fleet="f", inventory="inv", nodes=("a", "b", "c"))
         run.finish_node(Outcome("b", Result.DONE, facts={"revision": "r1"}))
-        run.finish_node(Outcome("c", Result.ROLLED_BACK, "no neighbour"))
+        run.finish_node(Outcome("c", Result.ROLLED_BACK, "no neighbor"))
         assert [outcome.result for outcome in journal.outcomes(run.id)] == [
             Result.PENDING,
             Result.DONE,
