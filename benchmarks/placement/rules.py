@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol
 
-from meshctl.placement.meter import Advice, RelayLink, LinkSnapshot, Meter, PathBeyond
+from meshctl.placement.meter import Advice, LinkSnapshot, Meter, PathBeyond, RelayLink
 from meshctl.placement.path_loss import Point
 
 BASE = 0

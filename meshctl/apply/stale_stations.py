@@ -166,9 +166,7 @@ def current_neighbors(observation: Observation, names: Mapping[str, str]) -> tup
 
 def _heard_macs(observation: Observation) -> frozenset[str]:
     fresh = (
-        neighbor.mac.lower()
-        for neighbor in observation.neighbors or ()
-        if neighbor.last_seen_ms <= NEIGHBOR_FRESH_MS
+        neighbor.mac.lower() for neighbor in observation.neighbors or () if neighbor.last_seen_ms <= NEIGHBOR_FRESH_MS
     )
     return frozenset((*fresh, *(station.mac.lower() for station in observation.stations or ())))
 

@@ -66,8 +66,8 @@ def run_events(
     *,
     notify: Callable[[str], None] = echo_error,
 ) -> Generator[RunEvent, None, None]:
-    """First the runs in progress, as `began`; then every new event. Raises DatabaseLost at the start; later, `notify` is
-    called, and the events of the meantime follow once the database is back."""
+    """First the runs in progress, as `began`; then every new event. Raises DatabaseLost at the start; later, `notify`
+    is called, and the events of the meantime follow once the database is back."""
     journal.wait_for_change(0.0)
     latest = journal.runs(limit=_RUNS)
     last = max((run.id for run in latest), default=0)

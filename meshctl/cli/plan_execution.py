@@ -17,7 +17,7 @@ from meshctl.cli.context import Session, confirm, line_width, selected_nodes
 from meshctl.cli.journaled_run import JournaledRun, journaled_run, print_totals, retry_command, run_context
 from meshctl.cli.output import console, echo_json
 from meshctl.cli.query_line import query_line
-from meshctl.cli.site_files import runs_at_site, replaced_by
+from meshctl.cli.site_files import replaced_by, runs_at_site
 from meshctl.errors import ExitCode, MeshctlError
 from meshctl.fleet import Outcome
 from meshctl.fleet.run_files import BEFORE, CHANGES, RunFiles

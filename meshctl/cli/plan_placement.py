@@ -16,7 +16,7 @@ from meshctl.errors import ExitCode, InputError
 from meshctl.placement.margin import UNMEASURED_FADE_DB
 from meshctl.placement.path_loss import PathLossModel, Point, RadioModel, Wall
 from meshctl.placement.picture import MapView, png, summary, svg
-from meshctl.placement.planner import PlacementPlan, MappedTerrain, Terrain, Walls, plan
+from meshctl.placement.planner import MappedTerrain, PlacementPlan, Terrain, Walls, plan
 
 VERSION = 1
 _WALL_DB = 12.0

@@ -18,7 +18,7 @@ from enum import Enum
 from meshctl.device.connection import Connection
 from meshctl.device.errors import CommandFailed
 from meshctl.device.framing import quoted
-from meshctl.device.parse.jsontext import mapping, parse_json, boolean
+from meshctl.device.parse.jsontext import boolean, mapping, parse_json
 from meshctl.device.parse.system import parse_boot_id, parse_meminfo, parse_uptime
 
 # `sysupgrade -T` unpacks and hashes the image.

@@ -24,7 +24,7 @@ from meshctl.errors import MeshctlError
 from meshctl.fleet.alarm_actions import AlarmExchange
 from meshctl.fleet.journal_schema import LAB_SEPARATOR, REMEMBER, SCHEMA
 from meshctl.fleet.outcome import Outcome, Result
-from meshctl.fleet.process import owner, is_process_alive, runs_here, this_process
+from meshctl.fleet.process import is_process_alive, owner, runs_here, this_process
 from meshctl.fleet.sqlite_file import BUSY_TIMEOUT_S, SqliteFile
 from meshctl.fleet.store import Claim, Statement, Store
 

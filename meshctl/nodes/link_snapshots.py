@@ -23,7 +23,7 @@ from meshctl.placement.margin import (
     filtered_snr_db,
     worse_snr_db,
 )
-from meshctl.placement.meter import RelayLink, LinkSnapshot, PathBeyond, Position
+from meshctl.placement.meter import LinkSnapshot, PathBeyond, Position, RelayLink
 
 QUERY_S = 3.0
 MAX_TABLE_AGE_S = 30.0

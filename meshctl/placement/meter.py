@@ -293,7 +293,9 @@ class Meter:
         if turns and not self._is_returning:
             self._turn = _Turn(hop.relay, hop.snr_db, self._driven_m)
             if max(hop.link_margin_db, other_db) < self._turn_loss_db():
-                return self._drop(snapshot, Advice.DROP_NOW, f"a bend: bends cost about {self._turn_loss_db():.0f} dB here")
+                return self._drop(
+                    snapshot, Advice.DROP_NOW, f"a bend: bends cost about {self._turn_loss_db():.0f} dB here"
+                )
         if other_db > VETO_DB:
             return Advice.GO, f"another relay is in reach with {other_db:.0f} dB"
         # the allowance of the last 10 s still has the fall in it

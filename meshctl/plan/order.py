@@ -147,7 +147,9 @@ def _step(
     elif len(reasons) > 1:
         reason = f"independent meshes at the same time: {'; '.join(reasons)}"
     nodes = tuple(name for batch in batches for name in batch)
-    return Stage(StageKind.ROLLING, nodes, reason, tuple(lost for batch in batches for lost in cut_off_by.get(batch[0], ())))
+    return Stage(
+        StageKind.ROLLING, nodes, reason, tuple(lost for batch in batches for lost in cut_off_by.get(batch[0], ()))
+    )
 
 
 def _batch_reason(batch: Sequence[str], lost: Sequence[str], paths: Mapping[str, Path], stays_up: bool) -> str:

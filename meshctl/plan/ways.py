@@ -73,11 +73,12 @@ def ways_of(
         _rolling_risk(in_order, plans),
     )
     count = len(simultaneous.nodes)
-    is_interrupted = [plans[name].cut > Cut.LOGIN for name in simultaneous.nodes]
-    lost = (
-        "all of them are interrupted at the same moment, once" if all(is_interrupted) else
-        f"{sum(is_interrupted)} of them are interrupted at the same moment, once" if any(is_interrupted) else "interrupts nothing"
-    )  # fmt: skip
+    interrupted = [plans[name].cut > Cut.LOGIN for name in simultaneous.nodes]
+    if any(interrupted):
+        affected = "all" if all(interrupted) else str(sum(interrupted))
+        lost = f"{affected} of them are interrupted at the same moment, once"
+    else:
+        lost = "interrupts nothing"
     at_once = Way(
         TOGETHER,
         len(together),

@@ -295,7 +295,9 @@ class RunDirectory:
 
     def is_alive(self) -> bool:
         """Whether one of the run's processes lives: the one that waits for its end, or the one that changes nodes."""
-        return any(is_process_alive(line) for path in (self.process, self.processes) for line in _text(path).splitlines())
+        return any(
+            is_process_alive(line) for path in (self.process, self.processes) for line in _text(path).splitlines()
+        )
 
     def taken_replaced(self) -> dict[str, Any]:
         """Node -> what the plan would replace on it, for the operator alone: it has the node's keys."""

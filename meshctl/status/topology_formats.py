@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from meshctl.report.duration import duration
-from meshctl.topology import Graph, Report, neighbors_of
+from meshctl.topology import Graph, Report, heard_by_name
 from meshctl.topology.cells import LinkCell
 from meshctl.wording import counted
 
@@ -68,7 +68,7 @@ def directions(reports: Mapping[str, Report], macs: Mapping[str, str]) -> dict[t
     return {
         (name, other): Direction(heard.quality, heard.signal_dbm, heard.last_seen_ms)
         for name, report in reports.items()
-        for other, heard in neighbors_of(report, macs).items()
+        for other, heard in heard_by_name(report, macs).items()
     }
 
 

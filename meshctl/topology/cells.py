@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 from meshctl.device.observation import Observation
 from meshctl.model import Band, Fleet, Node
-from meshctl.topology.observed import Report, neighbors_of
+from meshctl.topology.observed import Report, heard_by_name
 from meshctl.topology.reports import report_of
 
 
@@ -64,7 +64,7 @@ def link_cells(
     found: dict[tuple[str, str], tuple[LinkCell, ...]] = {}
     for mesh in meshes:
         for name, report in mesh_reports(fleet, observations, mesh).items():
-            for other in neighbors_of(report, names):
+            for other in heard_by_name(report, names):
                 cell = LinkCell(
                     mesh, fleet.meshes[mesh].band, _channel(fleet, fleet.nodes[name], observations[name], mesh)
                 )

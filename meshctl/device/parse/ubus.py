@@ -5,7 +5,7 @@ from __future__ import annotations
 from types import MappingProxyType
 
 from meshctl.device.observation import BoardInfo, NetInterface, RadioState, ReleaseInfo
-from meshctl.device.parse.jsontext import integer, mapping, maps, parse_json, string, strings, boolean
+from meshctl.device.parse.jsontext import boolean, integer, mapping, maps, parse_json, string, strings
 
 
 def parse_board(text: str) -> tuple[BoardInfo, ReleaseInfo | None] | None:

@@ -282,9 +282,7 @@ def test_unobserved_neighbors_are_queried_when_the_node_is_back() -> None:
 
 
 def test_unanswered_queries_are_retried_at_the_end_and_the_rest_is_reported() -> None:
-    near = Neighbors(
-        {"b02": node("b02", "b01", "b03", "b04"), "b01": node("b01", "b02")}, silent=("b01", "b03", "b04")
-    )
+    near = Neighbors({"b02": node("b02", "b01", "b03", "b04"), "b01": node("b01", "b02")}, silent=("b01", "b03", "b04"))
     flush = near.flushes.listener(near.job, EVERY_RADIO)
     flush.started()
     flush.ended(node("b02"))

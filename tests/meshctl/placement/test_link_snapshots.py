@@ -13,7 +13,7 @@ from meshctl.device.framing import quoted
 from meshctl.device.link_table import LinkTable, links_script, parse_links
 from meshctl.device.parse.sections import split_sections
 from meshctl.nodes.link_snapshots import HopMargins, MeshTables, assemble, path_beyond
-from meshctl.placement.meter import RelayLink, PathBeyond
+from meshctl.placement.meter import PathBeyond, RelayLink
 from meshctl.robots.local_daemon import DaemonError, LocalDaemon
 
 MACS = {name: f"02:00:00:00:00:{index:02x}" for index, name in enumerate(("base", "b01", "b02", "spot1"), 1)}

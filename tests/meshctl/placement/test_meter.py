@@ -18,7 +18,7 @@ from meshctl.placement.margin import (
     slope_db_per_m,
     worse_snr_db,
 )
-from meshctl.placement.meter import Advice, RelayLink, LinkSnapshot, Meter, PathBeyond, Reading
+from meshctl.placement.meter import Advice, LinkSnapshot, Meter, PathBeyond, Reading, RelayLink
 from meshctl.placement.reading import is_due_to_speak, large, line, page, reading_json, words
 
 NEEDED_DB = 7.0
@@ -232,8 +232,12 @@ def test_before_the_first_link_nothing_is_claimed() -> None:
 def test_the_stock_of_beacons_carries_as_many_spacings() -> None:
     meter = Meter(NEEDED_DB)
     for depth_m in range(30):
-        snapshot = LinkSnapshot(float(depth_m), (RelayLink("base", falling(depth_m)),), {"base": PathBeyond(0)}, (depth_m, 0.0, 0.0))
-        reading = meter.step(LinkSnapshot(snapshot.now_s, snapshot.links, snapshot.paths, snapshot.position, beacons=3, spacing_m=40.0))
+        snapshot = LinkSnapshot(
+            float(depth_m), (RelayLink("base", falling(depth_m)),), {"base": PathBeyond(0)}, (depth_m, 0.0, 0.0)
+        )
+        reading = meter.step(
+            LinkSnapshot(snapshot.now_s, snapshot.links, snapshot.paths, snapshot.position, beacons=3, spacing_m=40.0)
+        )
     assert reading.meters_left is not None
     assert reading.depth_left_m == pytest.approx(reading.meters_left + 120.0)
 
