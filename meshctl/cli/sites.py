@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import sys
 import tempfile
 import time
 from collections.abc import Iterable
@@ -16,6 +15,7 @@ import typer
 
 from meshctl import __version__
 from meshctl.cli.context import AsJson, DryRun, InventoryPath, KeyFiles, Lab, Session, session
+from meshctl.cli.key_pinning import pin_host_key
 from meshctl.cli.output import echo, echo_json
 from meshctl.cli.site_status import as_object, exit_code, query_sites, show
 from meshctl.device.errors import AuthenticationRefused
@@ -242,23 +242,7 @@ def _pin(opened: Session, site: Site, *, may_replace: bool, yes: bool) -> bool:
         echo(f"{site.name}: {error}" + (f"\n  hint: {error.hint}" if error.hint else ""))
         return False
     name = f"{PIN_PREFIX}{site.name}"
-    pinned = opened.trust.pinned(name)
-    line = f"{site.name}: {shown.fingerprint} ({shown.key_type})"
-    if shown in pinned:
-        echo(f"{line}: pinned")
-        return True
-    if pinned and not may_replace:
-        echo(f"{line}: DIFFERS from the pinned {', '.join(host_key.fingerprint for host_key in pinned)}")
-        echo("  hint: another computer, a new installation, or an attack: verify, then use --replace")
-        return False
-    if yes or (sys.stdin.isatty() and typer.confirm(f"{line}\n  Does this match the fingerprint on the gateway?")):
-        opened.trust.replace(name, shown)
-        echo(f"{line}: pinned now")
-        return True
-    echo(f"{line}: not pinned")
-    if not sys.stdin.isatty():
-        echo("  hint: not a terminal: cannot ask; compare the fingerprint with the gateway's, then pass --yes")
-    return False
+    return pin_host_key(opened.trust, name, shown, label=site.name, device="gateway", may_replace=may_replace, yes=yes)
 
 
 def _presented_key(opened: Session, site: Site) -> HostKey:
