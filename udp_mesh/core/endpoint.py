@@ -155,7 +155,7 @@ class Endpoint:
     def is_quiet(self) -> bool:
         """Whether there is nothing to send and no event until `next_timer`, so that the driver may skip the node.
 
-        True after most bulk datagrams, of which only every few request an acknowledgement.
+        True after most bulk datagrams, of which only every few request an acknowledgment.
         """
         if self._logs is not None and self._logs.has_work:
             return False
@@ -273,7 +273,7 @@ class Endpoint:
 
     @property
     def late_acknowledgements(self) -> int:
-        """Acknowledgements so far that their receivers wanted sooner, because the driver reads too seldom for them."""
+        """Acknowledgments so far that their receivers wanted sooner, because the driver reads too seldom for them."""
         return self._state.late_acknowledgements
 
     def legacy_positions(self) -> dict[str, ReceivePosition]:

@@ -261,7 +261,7 @@ class LegacyPeers:
         return at
 
     def handle_timer(self, now: float) -> None:
-        """Send acknowledgements that are due; once a second heartbeats, offline checks and purges."""
+        """Send acknowledgments that are due; once a second heartbeats, offline checks and purges."""
         for legacy in self._active():
             if legacy.link:
                 self._acknowledge(legacy, legacy.acks.due(now))

@@ -37,7 +37,7 @@ class Forwarding:
         self.tags: dict[bytes, bytes] = {}
         """First bytes of a boot id -> boot id, of selected routes."""
         self.ack_due: dict[bytes, None] = {}
-        """Neighbors to which an acknowledgement is owed."""
+        """Neighbors to which an acknowledgment is owed."""
         self.queued: dict[bytes, None] = {}
         """Neighbors to which something may be sent."""
 
@@ -114,6 +114,6 @@ class Forwarding:
                     self.counters.passed_on_bytes += item.size
             self.counters.dropped_queue += neighbour.queue.dropped - dropped
             if room > 0:
-                # It waits for an acknowledgement, or has nothing more.
+                # It waits for an acknowledgment, or has nothing more.
                 del self.queued[boot_id]
         out[:0] = first

@@ -26,7 +26,7 @@ MAX_LINK_COST = 16 * 64
 SUSPECT_COST = 16 * LINK_COST
 """Added while what is sent to a neighbor is not acknowledged: another route is better, but none is worse."""
 ACK_EVERY = 8
-"""Carried datagrams per acknowledgement of a hop."""
+"""Carried datagrams per acknowledgment of a hop."""
 ACK_DELAY_S = 0.008
 _HISTORY = (1 << HISTORY_ROUNDS) - 1
 
@@ -73,7 +73,7 @@ class HopLink:
         )
 
     def cost(self, interval_s: float, now: float) -> int:
-        """Expected transmissions of a datagram and its acknowledgement (ETX), in sixteenths."""
+        """Expected transmissions of a datagram and its acknowledgment (ETX), in sixteenths."""
         both = self.quality(interval_s, now) * self.reported / 255
         return min(MAX_LINK_COST, round(LINK_COST / both)) if both > LINK_COST / MAX_LINK_COST else MAX_LINK_COST
 
@@ -94,7 +94,7 @@ class HopNeighbour:
     links: dict[str, HopLink] = field(default_factory=dict)
     window: HopWindow = field(default_factory=HopWindow)
     unacknowledged: int = 0
-    """Carried datagrams since our last acknowledgement."""
+    """Carried datagrams since our last acknowledgment."""
     largest: int = -1
     largest_at: float = 0.0
     ack_at: float = float("inf")
