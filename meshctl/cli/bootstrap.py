@@ -168,7 +168,7 @@ def _given_places(opened: Session, at: list[str], interfaces: list[str], site: s
 
 
 def _expected_places(opened: Session, words: list[str], limits: list[str], at: list[BenchTarget]) -> list[BenchTarget]:
-    """Which node is expected at which place."""
+    """The places, each with the node expected there."""
     selected = selected_nodes(opened.fleet, words, limits, in_word_order=True) if words or limits else ()
     expected = [node.name for node in selected]
     if opened.lab is not None and not at:

@@ -68,7 +68,7 @@ def history(
 
 @dataclass(frozen=True, slots=True)
 class _RunFilter:
-    """Which runs are listed; None matches all."""
+    """Selects the runs to list; None matches all."""
 
     node: str | None
     fleet: str | None

@@ -1,4 +1,4 @@
-"""What changes with every edit of an inventory: commands that run for hours read it again."""
+"""Values that follow every edit of the inventory, for commands that run for hours."""
 
 from __future__ import annotations
 

@@ -98,7 +98,7 @@ def status(
 
 
 class _StatusQuery:
-    """Which part of the fleet is queried, and how it is shown."""
+    """Selects the part of the fleet to query, and how to show it."""
 
     def __init__(self, fleet_view: FleetView, chosen: Filter, only: bool, topics: bool, wide: bool) -> None:
         self._fleet_view = fleet_view

@@ -259,7 +259,7 @@ def _mesh(
     tuple[Originator, ...] | None,
     Mapping[str, MeshTableSizes] | None,
 ]:
-    """Of all batman-adv interfaces together, and the sizes of each one's tables; all None without any."""
+    """Facts of all batman-adv interfaces together, and the sizes of each one's tables; all None without any."""
     names = reader.names("batctl.originators_json")
     if not names:
         return None, None, None, None

@@ -1,7 +1,7 @@
 """OpenWrt operations on a node: uptime, files, backup, firmware, reload, reboot.
 
-Each runs one short script over a `Connection`, with absolute paths of the tools that change something. What ends the
-connection (reboot, sysupgrade) is started as a detached process after a delay, so that the answer arrives.
+Each runs one short script over a `Connection`, with absolute paths of the tools that change something. Actions
+that end the connection (reboot, sysupgrade) start as a detached process after a delay, so that the answer arrives.
 """
 
 from __future__ import annotations

@@ -31,8 +31,8 @@ NAME_CHARACTERS = re.compile("[^A-Za-z0-9._-]+")
 
 @dataclass(frozen=True, slots=True)
 class ImportOptions:
-    """What the operator says of the device. `secret_file` gives the path, as the inventory writes it, of the file for
-    the key of the mesh of that name."""
+    """The operator's statements about the device. `secret_file` gives the path, as the inventory writes it, of the file
+    for the key of the mesh of that name."""
 
     name: str = ""
     address: IpInterface | None = None
@@ -50,9 +50,9 @@ class ImportOptions:
 
 @dataclass(frozen=True, slots=True)
 class Entries:
-    """What to set in the inventory, by path in the document's order. `secrets` are the keys for new files, by the path
-    that `values` has; `assumed` are values that the device does not know; `sections` are the names under which meshctl
-    renders the device's sections: (package, name) -> name."""
+    """Values to set in the inventory, by path in the document's order. `secrets` are the keys for new files, by the
+    path that `values` has; `assumed` are values that the device does not know; `sections` are the names under which
+    meshctl renders the device's sections: (package, name) -> name."""
 
     name: str
     values: Mapping[Path, Value]

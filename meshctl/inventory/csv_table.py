@@ -243,7 +243,7 @@ def _errors_of(values: Mapping[str, str], place: Position) -> Iterator[Diagnosti
 
 
 def _not_as_on_the_device(value: str) -> tuple[str, str] | None:
-    """What a spreadsheet or a copy from a page made of a value, and what to do; None if it may be as it was."""
+    """How a spreadsheet or a copied page has changed a value, and the remedy; None if the value may be unchanged."""
     shown = f"'{printable(value)}'"
     if _FORMULA.fullmatch(value):
         return f"{shown}, a formula or its error", "save the sheet with values instead of formulas"

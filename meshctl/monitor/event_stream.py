@@ -1,6 +1,6 @@
 """Server-sent events for every open page: frames as they are appended, alarms when they change.
 
-What is sent is built once per change for all pages: `FrameStore.revision` says whether the file changed, also by
+Events are built once per change for all pages: `FrameStore.revision` says whether the file changed, also by
 another process. docs/monitor.md describes the events.
 """
 

@@ -125,7 +125,7 @@ def _heard(mesh: MeshTables, name: str) -> tuple[int, int | None] | None:
 
 def path_beyond(mesh: MeshTables, margins: HopMargins, relay: str) -> PathBeyond | None:
     """The way from a relay to the base by the nodes' own next hops; None if it has none, or if it leads through the
-    robot itself. Of a relay that has not been asked yet, only that it is one hop at least."""
+    robot itself. For a relay that has not been queried yet, one hop at least."""
     found: list[tuple[float, float]] = []
     node, hops = relay, 0
 

@@ -43,8 +43,8 @@ class ConfigurationError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Configuration:
-    """What meshctl renders for one robot. `macs` are those of the inventory; `names` is the file of those that were
-    observed: MAC -> node."""
+    """The configuration that meshctl renders for one robot. `macs` are those of the inventory; `names` is the file of
+    those that were observed: MAC -> node."""
 
     robot: str
     radios: tuple[OwnRadio, ...]

@@ -198,7 +198,7 @@ def _transfer(
 
 
 def _prepare_collector(host: Host, robot: str, options: DeployOptions) -> dict[str, str]:
-    """What is known of the radios by now goes to the robot's collector. Returns its public key as a fact, if it has
+    """Give the robot's collector the current facts about the radios. Returns its public key as a fact, if it has
     one."""
     if not has_collector(options.fleet, robot):
         return {}

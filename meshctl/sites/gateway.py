@@ -185,8 +185,8 @@ def _tree(folder: Path, name: str) -> Iterator[TarMember]:
 
 
 def requirements(extra: str = "") -> tuple[str, ...]:
-    """What meshctl itself requires, as in its package's metadata, and what one of its extras does, without extras of
-    that: they are for operators."""
+    """The requirements of meshctl in its package's metadata, and those of one of its extras; other extras are for
+    operators."""
     found: list[str] = []
     for line in distribution(_DISTRIBUTION).requires or ():
         requirement, _, marker = line.partition(";")

@@ -51,7 +51,7 @@ class JpegOptions(NamedTuple):
 
 
 class Reduction(NamedTuple):
-    """What to reduce of a topic. `voxel_m`: one point per cube of this edge, with `adapt` up to `max_voxel_m`;
+    """How to reduce a topic. `voxel_m`: one point per cube of this edge, with `adapt` up to `max_voxel_m`;
     `fields`: those of a cloud's points to keep, empty for all. `adapt` needs `rate_hz`."""
 
     rate_hz: Optional[float] = None

@@ -227,7 +227,7 @@ class Endpoint:
         return None if self.thin is None else self.thin.conditions(now)
 
     def versions(self) -> tuple[VersionConditions, ...]:
-        """What was sent and received as versions, by topic."""
+        """Versions sent and received, by topic."""
         return self._state.versions.conditions()
 
     def conditions(self, now: float) -> Conditions:
@@ -277,7 +277,7 @@ class Endpoint:
         return self._state.late_acknowledgements
 
     def legacy_positions(self) -> dict[str, ReceivePosition]:
-        """What was received from each legacy peer. Save it: the next run needs it to keep their senders going."""
+        """The position of each legacy peer's messages. Save it: the next run needs it to keep their senders going."""
         return self._legacy.positions()
 
     def close(self, now: float) -> None:

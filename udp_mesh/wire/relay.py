@@ -152,7 +152,7 @@ def encode_hop_ack(ack: HopAck) -> bytes:
 
 
 def decode_relay(data: bytes | memoryview) -> RelayFrame:
-    """What an opened relay datagram holds; a carried datagram is a view into `data`. Raises `DecodeError`."""
+    """The frame in an opened relay datagram; a carried datagram is a view into `data`. Raises `DecodeError`."""
     reader = Reader(data)
     kind = reader.integer(1, "relay frame type")
     match kind:

@@ -218,7 +218,7 @@ class Ros1Bridge:
         self._check(published, table, topics, peers)
 
     def _system_state(self) -> SystemState:
-        """What other nodes publish and subscribe to; nothing while there is no master."""
+        """The topics that other nodes publish and subscribe to; none while there is no master."""
         try:
             return self._graph.system_state()
         except MASTER_ERRORS as error:

@@ -32,7 +32,7 @@ def target_queue_s(min_rtt: float) -> float:
 
 
 def loss_queue_s(loss: float) -> float:
-    """What is added for losses."""
+    """The additional queue for losses."""
     return LOSS_QUEUE_S * min(1.0, loss / FULL_LOSS_QUEUE_AT)
 
 

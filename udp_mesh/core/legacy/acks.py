@@ -54,7 +54,7 @@ of 600 messages a second comes in one second."""
 
 
 class ReceivePosition(NamedTuple):
-    """What was received from a legacy peer, so that the next run of this node can free its slots."""
+    """The newest messages received from a legacy peer, with which the next run of this node can free its slots."""
 
     latest: int
     """The latest message number."""
@@ -131,7 +131,7 @@ class LegacyAcks:
         return [ack for sequence in following - self._incomplete.keys() for ack in _first(sequence)]
 
     def position(self) -> ReceivePosition | None:
-        """What the next run of this node needs to know (None: nothing was received)."""
+        """The position for the next run of this node (None: nothing was received)."""
         if self._latest is None:
             return None
         return ReceivePosition(

@@ -146,7 +146,7 @@ class LegacyPeers:
         return len(self._by_host)
 
     def positions(self) -> dict[str, ReceivePosition]:
-        """What was received from each peer, for the next run of this node."""
+        """The receive position of each peer, for the next run of this node."""
         known = ((legacy.peer.name, legacy.acks.position()) for legacy in self._active())
         return {name: position for name, position in known if position is not None}
 

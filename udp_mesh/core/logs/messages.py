@@ -54,7 +54,7 @@ def item_topic(topic: str) -> str:
 
 
 class Holder(NamedTuple):
-    """What a reader has of one log, as far as the sender knows."""
+    """The items of one log that a reader has, as far as the sender knows."""
 
     reader: str
     ranges: Ranges

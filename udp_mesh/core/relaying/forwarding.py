@@ -23,7 +23,7 @@ _NEVER = float("inf")
 
 
 class Forwarding:
-    """What waits here for next hops, and what is owed to previous ones."""
+    """The datagrams that wait for next hops, and the acknowledgments due to previous ones."""
 
     def __init__(self, state: State, channels: HopChannels, routes: Routes) -> None:
         self._state = state

@@ -157,6 +157,6 @@ def on_hello(
 
 
 def heard_on(link: HopLink, neighbor: HopNeighbor, *, passes: bool, now: float) -> HeardHop:
-    """What we tell a neighbor about its hellos on a link."""
+    """Our report to a neighbor about its hellos on a link."""
     quality = round(255 * link.quality(neighbor.interval_s, now))
     return HeardHop(neighbor.tag, max(0, link.round), quality, passes)
