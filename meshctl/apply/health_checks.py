@@ -63,7 +63,7 @@ def expectation(desired: DesiredState, before: Observation, base_macs: Iterable[
     return Expectation(
         wireless,
         trees.get("network"),
-        # what only a radio heard that is turned off is not heard again
+        # nodes that only a radio heard that is off now are not heard again
         heard_neighbors(replace(before, neighbors=tuple(n for n in before.neighbors or () if n.ifname not in off))),
         frozenset(mac.lower() for mac in base_macs) & originators,
         off,

@@ -239,7 +239,7 @@ def watch_script(node: str, entries: Iterable[StationEntry], *, for_s: float) ->
     watched = [f"{entry.ifname}/{entry.mac}" for entry in entries]
     pid_file = quoted(f"/tmp/meshctl/forget.{node}.pid")
     loop = f"{script('stale_station.sh')}watch_stale {math.ceil(for_s)} {quoted(*watched)}\nrm -f {pid_file}"
-    # of a watch that was killed the number stays, and may be another process's by now
+    # the process id of a killed watch stays, and may be another process's by now
     return (
         f"mkdir -p /tmp/meshctl; pid=$(cat {pid_file} 2>/dev/null); rm -f {pid_file}\n"
         '[ -z "$pid" ] || ! grep -q watch_stale "/proc/$pid/cmdline" 2>/dev/null || kill "$pid"\n'

@@ -378,7 +378,7 @@ def _identity_changes(
         for word in ("mac", "serial", "label"):
             if editor.has(("nodes", spare.name, word)):
                 editor.remove(("nodes", spare.name, word))
-    # those of the old device: another device may have them one day, and this one's are observed
+    # the old device's values: another device may have them one day, and this one's are observed
     for radio in node.radios:
         if editor.has(("nodes", node.name, "radios", radio.name, "mac")):
             editor.remove(("nodes", node.name, "radios", radio.name, "mac"))

@@ -134,7 +134,7 @@ def _fleet_sections(draft: _Draft, name: str, radios: Iterable[ExistingRadio]) -
     draft.values[("meshctl",)] = 1
     draft.values[("fleet",)] = options.fleet or device.marker.get("fleet", "") or as_name(f"{name}-fleet")
     draft.values[("country",)] = country
-    # that of a collector may do nothing but print links, and is no operator's
+    # a collector's key may only print links, and is no operator's
     logins = tuple(key for key in device.authorized_keys if LINKS_PATH not in key)
     keys = logins or ((options.operator_key,) if options.operator_key else ())
     operators: dict[str, Value] = {"ssh_keys": list(keys)}

@@ -174,7 +174,7 @@ def _run(command: Sequence[str], document: Mapping[str, Any], timeout_s: float) 
     try:
         process.communicate(json.dumps(document).encode(), timeout_s)
     except subprocess.TimeoutExpired:
-        # what it started, too
+        # with the processes that it started
         with suppress(ProcessLookupError, PermissionError):
             os.killpg(process.pid, signal.SIGKILL)
         process.kill()

@@ -140,7 +140,7 @@ class FrameSampler:
 
     def _failed(self, problem: str) -> None:
         if self._end.is_set():
-            # what it needs may be closed already
+            # its connections may be closed already
             return
         self.problem = problem
         self._wait_s = self.interval_s

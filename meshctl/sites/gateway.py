@@ -38,7 +38,7 @@ _EXTENSIONS = "meshctl.extensions"
 _PIP_TIMEOUT_S = 600
 _INSTALL_TIMEOUT_S = 600.0
 _KEPT_RELEASES = 3
-# of gzip: the highest takes four times as long for one percent
+# gzip level: the highest takes four times as long for one percent
 _LEVEL = 6
 _DIGITS = 16
 

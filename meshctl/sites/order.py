@@ -57,7 +57,7 @@ class Order:
     plan_sha256: str
     part_sha256: str
     rate_kb_s: float | None = None
-    # of an order that may wait for its site, by the operator's clock (Unix time)
+    # set for an order that may wait for its site, by the operator's clock (Unix time)
     signed_s: float = 0.0
     expires_s: float | None = None
     # the hash of the firmware images' paths and hashes, and who may read what the run replaces

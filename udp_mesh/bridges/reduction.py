@@ -132,7 +132,7 @@ class DetailController:
     def _move(self, change: float) -> None:
         moved = min(1.0, max(0.0, self.detail + change))
         if change < 0 and moved != self.detail:
-            # what follows tells about the smaller messages
+            # the next outcomes are those of the smaller messages
             self._latencies.clear()
         self.detail = moved
 

@@ -14,7 +14,7 @@ from meshctl.model.ip import IpNetwork
 from meshctl.resolve.intent import LAN
 from meshctl.uci import Package, Section
 
-# what libuci's users read as true
+# values that libuci's users read as true
 _TRUE = ("1", "on", "true", "yes", "enabled")
 
 

@@ -25,7 +25,7 @@ class LostConnections:
     """Chooses the names to register again. One for publishers, one for subscribers."""
 
     def __init__(self) -> None:
-        # of each name, how many connections are missing, and in how many checks in a row
+        # by name: how many connections are missing, and in how many checks in a row
         self._checks: dict[str, tuple[int, int]] = {}
 
     def due(self, connected: Mapping[str, int], listed: Mapping[str, Iterable[str]]) -> list[str]:
