@@ -43,7 +43,7 @@ LINK = "mesh0"
 IP_UDP_BYTES = 28
 CHANNEL_BITS_PER_S = 20e6
 TRANSMISSION_S = 0.0001
-"""Preamble, spacing and acknowledgement of a radio."""
+"""Preamble, spacing and acknowledgment of a radio."""
 TELEMETRY_S = 0.2
 POWER_ON_SPREAD_S = 2.0
 MAX_DURATION_S = 900.0

@@ -26,7 +26,7 @@ from meshctl.device.observation import (
     ChannelSurvey,
     Load,
     Memory,
-    MeshNeighbour,
+    MeshNeighbor,
     Observation,
     Originator,
     ReleaseInfo,
@@ -157,7 +157,7 @@ class SimulatedFleet:
             surveys=(ChannelSurvey("mesh0", 2437, _NOISE_DBM, active_ms, int(active_ms * 0.3)),),
             sensors=Sensors({"phy0": self.rng.randint(0, 120)}, {"phy0": 45.0 + self.rng.random()}),
             bridges=(Bridge("br-lan", ("eth0", "bat0")),),
-            neighbours=tuple(MeshNeighbour(self.macs[other], "mesh0", self.rng.randint(20, 900)) for other in heard),
+            neighbors=tuple(MeshNeighbor(self.macs[other], "mesh0", self.rng.randint(20, 900)) for other in heard),
             originators=tuple(
                 Originator(self.macs[other], self.macs[other], "mesh0", 100, True, tq=self.rng.randint(180, 255))
                 for other in heard

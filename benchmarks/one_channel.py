@@ -9,8 +9,8 @@ that link's goals; the radio does not retransmit lost frames.
    WMM access categories.
 2. *guests*: one additional robot sends only urgent telemetry, the others fill the channel. Measured is its latency.
 3. *hops*: 1 Hz reports over three lossy hops; measured is the standard deviation of the time between two arrivals.
-4. *acknowledgements*: one robot's bulk with an acknowledgement every N packets; measured are their share of the airtime
-   and the bulk relative to the channel's capacity without acknowledgements.
+4. *acknowledgments*: one robot's bulk with an acknowledgment every N packets; measured are their share of the airtime
+   and the bulk relative to the channel's capacity without acknowledgments.
 """
 
 from __future__ import annotations
@@ -245,14 +245,14 @@ def hops(loss: float, *, bulk: bool, seed: int = 1) -> dict[str, Any]:
     }
 
 
-def acknowledgements(every: int, rate: float) -> dict[str, Any]:
+def acknowledgments(every: int, rate: float) -> dict[str, Any]:
     world = OneChannel(
         1, channel=channel(rate=rate), loss=0.0, seed=1, rates=Rates(ack_every_packets=every), telemetry=False
     )
     world.run()
     (bulk,) = world.bulk_bits_per_s()
     return {
-        "set": "acknowledgements",
+        "set": "acknowledgments",
         "every": every,
         "rate": rate,
         "default": every == Rates().ack_every_packets,
@@ -282,7 +282,7 @@ def results_of(*, quick: bool) -> Iterator[dict[str, Any]]:
         for bulk in (False, True):
             yield hops(loss, bulk=bulk)
     for every in (10,) if quick else (1, 2, 4, 8, 10, 16):
-        yield acknowledgements(every, 20e6)
+        yield acknowledgments(every, 20e6)
 
 
 def tables(results: Sequence[dict[str, Any]]) -> str:
@@ -325,15 +325,15 @@ def tables(results: Sequence[dict[str, Any]]) -> str:
             ])
         )  # fmt: skip
     head = [
-        "packets per acknowledgement",
+        "packets per acknowledgment",
         "bulk, Mbit/s",
         "of the ack-free ceiling",
-        "acknowledgements' airtime",
+        "acknowledgments' airtime",
         "goal",
     ]
     head += [""]
     parts.append([row(head), row(["---"] * len(head))])
-    for result in (result for result in results if result["set"] == "acknowledgements"):
+    for result in (result for result in results if result["set"] == "acknowledgments"):
         parts[-1].append(
             row([
                 f"{result['every']}{' (default)' if result['default'] else ''}",

@@ -149,7 +149,7 @@ def _say(text: str) -> None:
 
 
 def airtime_us(rate: int, length: int, kind: str) -> float:
-    """Airtime of one transmission in microseconds: DIFS, the mean back-off, the frame, and a probe's acknowledgement.
+    """Airtime of one transmission in microseconds: DIFS, the mean back-off, the frame, and a probe's acknowledgment.
 
     IEEE 802.11-2020 clauses 15 (DSSS), 17 (OFDM) and 19 (HT, if the rate is unknown: MCS 7, 65 Mbit/s); slots of
     9 us, a first contention window of 15 slots.
@@ -163,7 +163,7 @@ def airtime_us(rate: int, length: int, kind: str) -> float:
         frame_us = 20 + 4 * -(-(22 + bits) // int(4 * mbit_s)) + 6
     else:
         frame_us = 36 + 4 * -(-(22 + bits) // 260) + 6
-    # broadcasts are not acknowledged; a probe's acknowledgement is sent at 6 Mbit/s
+    # broadcasts are not acknowledged; a probe's acknowledgment is sent at 6 Mbit/s
     acknowledged_us = 10 + 44 if kind == "probe" else 0
     return spacing_us + frame_us + acknowledged_us
 

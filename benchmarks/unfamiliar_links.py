@@ -1,4 +1,4 @@
-"""Links that the transport was not tuned to, in virtual time: `python -m benchmarks.unfamiliar_links [--fill]`.
+"""Links that the transport was not tuned for, in virtual time: `python -m benchmarks.unfamiliar_links [--fill]`.
 
 Each link of `udp_mesh.sim.links.cells` under the standard load, several seeds; beside it one TCP flow alone on the same
 link with the same losses (models of CUBIC and BBR). Shares are payload of what the link can carry; urgent latencies

@@ -1,4 +1,4 @@
-"""Which cases run next, and which one is to blame when workers die. Pure: `run` submits and waits.
+"""Choose the cases to run next, and find the one to blame when workers die. Pure: `run` submits and waits.
 
 When a worker dies, every case that was running is a suspect: a pool does not say which one it was. Suspects run again
 after all others, in rounds with a quarter of the cases at once, down to one. A case that kills its worker twice while

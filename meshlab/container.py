@@ -25,7 +25,7 @@ FLAGS = ns.CLONE_NEWNS | ns.CLONE_NEWPID | ns.CLONE_NEWNET | ns.CLONE_NEWUTS | n
 _DEVICES = ("null", "zero", "full", "random", "urandom", "tty")
 # /tmp is limited to half of the memory, the default of the kernel's tmpfs
 _TMP_SHARE = 2
-# of the machine (machine_root/init); its own processes count upwards from 1, and see those of all nodes
+# the machine's maximum process id (machine_root/init); its own processes count from 1, and see those of all nodes
 PID_MAX = 4194304
 _PIDS_PER_NODE = 65536
 _ENVIRONMENT = {"PATH": "/usr/sbin:/usr/bin:/sbin:/bin", "HOME": "/", "TERM": "vt102"}

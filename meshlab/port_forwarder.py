@@ -14,17 +14,14 @@ import socket
 from dataclasses import dataclass
 
 from meshlab.addresses import FACTORY_ADDRESS, bench_of, loopback_of
-from meshlab.errors import LabError
 from meshlab.fleet_state import FleetState, NodeControl
 from meshlab.link_state import LinkState
+from meshlab.listeners import Listeners, lock_port
 from meshlab.shaped_tunnel import Shape, Tunnel, reset
 from meshlab.spec import Medium
 
 log = logging.getLogger("meshlab.port_forwarder")
 _SSH_PORT = 22
-_BACKLOG = 16
-# tried in order when the fleet's spec has no port
-_FIRST_PORT, _LAST_PORT = 20022, 20999
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,8 +41,7 @@ class PortForwarder:
         self._fleet = fleet
         self._link_state = link_state
         self._control = control
-        self._listening: dict[ForwardedPort, tuple[socket.socket, asyncio.Task[None]]] = {}
-        self._tunnels: set[asyncio.Task[None]] = set()
+        self._listeners: Listeners[ForwardedPort] = Listeners(lambda port: port.host, self._serve)
         self.port = fleet.spec.port
         self._port_lock: socket.socket | None = None
         # a fixed seed, so that losses are the same in every run
@@ -56,13 +52,7 @@ class PortForwarder:
         self._port_lock, self.port = lock_port(self.port)
 
     async def close(self) -> None:
-        for listener, task in self._listening.values():
-            task.cancel()
-            listener.close()
-        tasks = [task for _, task in self._listening.values()] + list(self._tunnels)
-        for task in self._tunnels:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
+        await self._listeners.close()
         if self._port_lock is not None:
             self._port_lock.close()
 
@@ -89,33 +79,7 @@ class PortForwarder:
 
     def refresh(self) -> None:
         """Open and close sockets to match `reachable`."""
-        reachable = set(self.reachable().values())
-        for port in self._listening.keys() - reachable:
-            listener, task = self._listening.pop(port)
-            task.cancel()
-            listener.close()
-        for port in reachable - self._listening.keys():
-            listener = socket.socket()
-            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            try:
-                listener.bind((port.host, self.port))
-            except OSError as error:
-                listener.close()
-                log.error("port-in-use host=%s port=%d error=%s", port.host, self.port, error)
-                continue
-            listener.listen(_BACKLOG)
-            listener.setblocking(False)
-            self._listening[port] = (listener, asyncio.ensure_future(self._accept(port, listener)))
-
-    async def _accept(self, port: ForwardedPort, listener: socket.socket) -> None:
-        loop = asyncio.get_running_loop()
-        while True:
-            client, _ = await loop.sock_accept(listener)
-            client.setblocking(False)
-            client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            task = asyncio.ensure_future(self._serve(port, client))
-            self._tunnels.add(task)
-            task.add_done_callback(self._tunnels.discard)
+        self._listeners.update(set(self.reachable().values()), self.port)
 
     async def _serve(self, port: ForwardedPort, client: socket.socket) -> None:
         loop = asyncio.get_running_loop()
@@ -158,28 +122,3 @@ class PortForwarder:
             pass
         finally:
             client.close()
-
-
-def lock_port(requested: int) -> tuple[socket.socket, int]:
-    """A socket that holds the fleet's port, and the port: `wanted`, or a free one for 0.
-
-    Raises LabError when the port (or every port of the range) is in use.
-    """
-    for port in (requested,) if requested else range(_FIRST_PORT, _LAST_PORT + 1):
-        claim = socket.socket()
-        try:
-            claim.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            claim.bind(("127.255.255.254", port))
-            claim.listen(1)
-        except OSError:
-            claim.close()
-            continue
-        return claim, port
-    if requested:
-        raise LabError(
-            f"port {requested} on 127.255.255.254 is in use", hint="another fleet may run; choose another --port"
-        )
-    raise LabError(
-        f"ports {_FIRST_PORT} to {_LAST_PORT} on 127.255.255.254 are all in use",
-        hint="stop another fleet, or choose --port",
-    )

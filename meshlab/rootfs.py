@@ -21,7 +21,7 @@ STAND_INS = Path(__file__).resolve().parent / "node_root"
 
 # applets that stand-ins replace: the fleet's busybox must not have these names
 _REPLACED = frozenset({"date", "sync", "fsync", "reboot", "poweroff", "halt", "logread", "logger", "sh", "ash"})
-# what the stand-ins' own shell looks for in PATH: the shell of scripts, and programs of a machine's own (lab/kernel)
+# programs that the stand-ins' own shell finds in PATH: the shell of scripts, and those of a machine (lab/kernel)
 _NOT_QUICK = frozenset({"sh", "ip", "ping", "ping6"})
 _APPLETS = STAND_INS / "lab" / "applets"
 _SEARCH_PATHS = ("/usr/local/sbin", "/usr/local/bin", "/usr/sbin", "/usr/bin", "/sbin", "/bin")

@@ -59,8 +59,8 @@ class PowerEvent:
 
 @dataclass(frozen=True, slots=True)
 class TrialSettings:
-    """What `mission_trial` needs besides: each robot reports every `report_s`, routes are chosen every `route_s`, slow
-    fading has this standard deviation and decorrelates over `shadow_m`."""
+    """Additional settings of `mission_trial`: each robot reports every `report_s`, routes are chosen every `route_s`,
+    slow fading has this standard deviation and decorrelates over `shadow_m`."""
 
     report_s: float = 1.0
     route_s: float = 1.0

@@ -213,7 +213,7 @@ class Supervisor:
         elif event["event"] == "started":
             self.fleet.nodes[event["node"]].pid = event["pid"]
         elif event["event"] == "exit":
-            # what it wrote before it ended is not of its next boot
+            # its output before it ended is not part of its next boot
             self._on_events()
             self._exited(self.fleet.nodes[event["node"]], event["status"], event["reason"])
 

@@ -6,7 +6,7 @@
  *   1. the port's drop-tail queue (queue frames),
  *   2. the transmitter: one per port, or one that all ports share when half=1; it is busy for
  *      IP bytes * 8 / rate + overhead_us, once per attempt; a lost unicast attempt is repeated up to attempts times,
- *      as a radio's own acknowledgements do,
+ *      as a radio's own acknowledgments do,
  *   3. loss: independent (loss), or in bursts by a two-state Gilbert-Elliott chain per port (burst_enter and
  *      burst_leave per frame, burst_loss inside a burst),
  *   4. the delay line (delay_ms), and out of the port that has the destination's address, or of all others.

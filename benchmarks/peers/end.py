@@ -23,7 +23,7 @@ from typing import Any
 from benchmarks import peers
 from benchmarks.peers import message
 
-# the time for the last acknowledgements to be sent after the bulk
+# the time for the last acknowledgments to be sent after the bulk
 _LINGER_S = 0.2
 
 

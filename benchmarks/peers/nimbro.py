@@ -5,7 +5,7 @@ times as many repair symbols, sent at once and in random order; nothing is ackno
 `rate` of the bulk topic is set so that its datagrams take 93 % of 10 Mbit/s. The receiver keeps the newest 31
 messages.
 
-TCP, `tcp`: the sender waits for one byte of acknowledgement after each message. The bulk topic, which must arrive,
+TCP, `tcp`: the sender waits for one byte of acknowledgment after each message. The bulk topic, which must arrive,
 goes there, and the urgent one over UDP with `fec 0.5`, which is how its documentation divides topics between the two.
 """
 

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol
 
-from meshctl.placement.meter import Advice, LinkLook, Look, Meter, PathBeyond
+from meshctl.placement.meter import Advice, LinkSnapshot, Meter, PathBeyond, RelayLink
 from meshctl.placement.path_loss import Point
 
 BASE = 0
@@ -167,11 +167,11 @@ class ByMeter:
     def step(self, view: View) -> Action:
         if self._meter is None:
             self._meter = Meter(view.required_snr_db)
-        links = tuple(LinkLook(str(relay), dbm, view.noise_dbm) for relay, dbm in view.rssi_dbm.items())
+        links = tuple(RelayLink(str(relay), dbm, view.noise_dbm) for relay, dbm in view.rssi_dbm.items())
         paths = {str(relay): path for relay, path in view.paths.items()}
         position = (view.at[0], view.at[1], 0.0)
         reading = self._meter.step(
-            Look(view.now_s, links, paths, position, heading_rad=view.heading, beacons=view.beacons)
+            LinkSnapshot(view.now_s, links, paths, position, heading_rad=view.heading, beacons=view.beacons)
         )
         if view.beacons == 0:
             return Action()

@@ -74,7 +74,7 @@ def execute(
         outcomes.update(ended)
         if stage.kind is StageKind.CANARY and any(outcome.result.is_failure for outcome in ended.values()):
             stopped = f"stopped: the canary {stage.nodes[0]} failed"
-        elif budget.spent:
+        elif budget.is_exhausted:
             stopped = budget.reason
     outcomes.update(_with_last_seen(prepared, run_context, contexts, outcomes))
     outcomes.update(_with_unflushed_neighbors(flushes.retry_unanswered(run_context), run_context, outcomes))

@@ -19,7 +19,7 @@ from meshctl.plan.cell import enabled_interfaces
 from meshctl.plan.left_over import interface_names, left_over
 from meshctl.plan.observed_files import WIRELESS, address_options, packages_seen
 from meshctl.plan.packages import NO_NEEDS, Needs, missing_packages
-from meshctl.topology import NEIGHBOUR_FRESH_MS
+from meshctl.topology import NEIGHBOR_FRESH_MS
 from meshctl.uci import Package, Section
 from meshctl.wording import counted
 
@@ -63,16 +63,16 @@ def expectation(desired: DesiredState, before: Observation, base_macs: Iterable[
     return Expectation(
         wireless,
         trees.get("network"),
-        # what only a radio heard that is turned off is not heard again
-        heard_neighbors(replace(before, neighbours=tuple(n for n in before.neighbours or () if n.ifname not in off))),
+        # nodes that only a radio heard that is off now are not heard again
+        heard_neighbors(replace(before, neighbors=tuple(n for n in before.neighbors or () if n.ifname not in off))),
         frozenset(mac.lower() for mac in base_macs) & originators,
         off,
     )
 
 
-def heard_neighbors(observation: Observation, fresh_ms: float = NEIGHBOUR_FRESH_MS) -> frozenset[str]:
+def heard_neighbors(observation: Observation, fresh_ms: float = NEIGHBOR_FRESH_MS) -> frozenset[str]:
     """The MACs of the mesh neighbors heard recently."""
-    return frozenset(n.mac.lower() for n in observation.neighbours or () if n.last_seen_ms <= fresh_ms)
+    return frozenset(n.mac.lower() for n in observation.neighbors or () if n.last_seen_ms <= fresh_ms)
 
 
 def unmet(expected: Expectation, after: Observation, *, since_s: float | None = None) -> tuple[str, ...]:
@@ -80,7 +80,7 @@ def unmet(expected: Expectation, after: Observation, *, since_s: float | None = 
 
     `since_s` is how long the change has been applied: what was heard before does not count.
     """
-    fresh_ms = NEIGHBOUR_FRESH_MS if since_s is None else min(NEIGHBOUR_FRESH_MS, since_s * 1000)
+    fresh_ms = NEIGHBOR_FRESH_MS if since_s is None else min(NEIGHBOR_FRESH_MS, since_s * 1000)
     return (
         *_reload(after),
         *_packages(expected, after),

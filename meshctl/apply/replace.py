@@ -96,7 +96,7 @@ def adopt(
         connection.close()
         raise
     pins = trust.pinned(old.name)
-    # that of the old device stays until the change is confirmed: whatever ends this process, either is trusted
+    # the old device's key stays until the change is confirmed: whatever ends this process, both are trusted
     trust.replace(old.name, key, *(pin for pin in pins if pin != key))
     new_name = name_of_new(old, spare)
     new_pins = trust.pinned(new_name)

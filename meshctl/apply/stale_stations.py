@@ -29,7 +29,7 @@ from meshctl.device.observation import Observation
 from meshctl.device.scripts import script
 from meshctl.model import Node
 from meshctl.plan.radios import EVERY_RADIO, SLACK_S, Radios
-from meshctl.topology import NEIGHBOUR_FRESH_MS, mesh_macs
+from meshctl.topology import NEIGHBOR_FRESH_MS, mesh_macs
 
 # Neighbors are queried repeatedly while the node is unreachable, because an entry is stale only once the radio is back
 # on the air. The pause doubles each time, up to a minute: Linux drops an inactive station of an ad-hoc cell after that
@@ -166,9 +166,7 @@ def current_neighbors(observation: Observation, names: Mapping[str, str]) -> tup
 
 def _heard_macs(observation: Observation) -> frozenset[str]:
     fresh = (
-        neighbour.mac.lower()
-        for neighbour in observation.neighbours or ()
-        if neighbour.last_seen_ms <= NEIGHBOUR_FRESH_MS
+        neighbor.mac.lower() for neighbor in observation.neighbors or () if neighbor.last_seen_ms <= NEIGHBOR_FRESH_MS
     )
     return frozenset((*fresh, *(station.mac.lower() for station in observation.stations or ())))
 
@@ -241,7 +239,7 @@ def watch_script(node: str, entries: Iterable[StationEntry], *, for_s: float) ->
     watched = [f"{entry.ifname}/{entry.mac}" for entry in entries]
     pid_file = quoted(f"/tmp/meshctl/forget.{node}.pid")
     loop = f"{script('stale_station.sh')}watch_stale {math.ceil(for_s)} {quoted(*watched)}\nrm -f {pid_file}"
-    # of a watch that was killed the number stays, and may be another process's by now
+    # the process id of a killed watch stays, and may be another process's by now
     return (
         f"mkdir -p /tmp/meshctl; pid=$(cat {pid_file} 2>/dev/null); rm -f {pid_file}\n"
         '[ -z "$pid" ] || ! grep -q watch_stale "/proc/$pid/cmdline" 2>/dev/null || kill "$pid"\n'

@@ -34,7 +34,7 @@ Device = Annotated[
     str, typer.Argument(help="A radio's name, robot:NAME for a robot's computer, `fleet` for the whole fleet.")
 ]
 Code = Annotated[str, typer.Argument(help="The alarm's code, as `meshctl alarms list` shows it.")]
-By = Annotated[str | None, typer.Option("--by", help="Who; default: you.")]
+By = Annotated[str | None, typer.Option("--by", help="Operator to record; default: you.")]
 
 
 @contextmanager
@@ -58,7 +58,7 @@ def _history(inventory: Path, lab: Path | None, store: Path | None) -> Iterator[
 
 @app.command("list")
 def list_alarms(
-    include_all: Annotated[bool, typer.Option("--all", help="Also alarms that ended.")] = False,
+    include_all: Annotated[bool, typer.Option("--all", help="Include alarms that have ended.")] = False,
     inventory: InventoryPath = Path(),
     store: HistoryFile = None,
     lab: Lab = None,

@@ -71,7 +71,7 @@ def backup(
     key: KeyFiles = None,
     lab: Lab = None,
 ) -> None:
-    """Back up nodes: configuration, keys and accounts. Backups hold secrets and are written with mode 0600.
+    """Back up nodes: configuration, keys and accounts. Backups contain secrets and have mode 0600.
 
     Example: meshctl backup 'husky*' --out backups
     """

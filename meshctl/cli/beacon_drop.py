@@ -9,7 +9,7 @@ from meshctl.placement.meter import Advice
 from meshctl.robots.local_daemon import DaemonError
 
 TOPIC = "deploy_beacon"
-# what the bridges publish as std_msgs/Bool with `data: true`
+# the payload that the bridges publish as std_msgs/Bool with `data: true`
 KINDS = {
     "ros1": ("std_msgs/Bool", b"\x01"),
     "ros2": ("std_msgs/msg/Bool reliable:volatile:1:", b"\x00\x01\x00\x00\x01"),

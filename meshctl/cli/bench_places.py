@@ -55,7 +55,7 @@ def with_site(fleet: Fleet, place: BenchTarget, site: str) -> BenchTarget:
 
 
 def no_answer_hint(place: BenchTarget, node: Node | None, *, is_pinned: bool) -> str:
-    """What it probably is that nothing answers at a place, and what to do; empty at an address that the operator gave.
+    """The probable reason why nothing answers at a place, and its remedy; empty at an address that the operator gave.
 
     `node` is expected there; `is_pinned` if it has a host key, as since its first bootstrap.
     """
@@ -89,7 +89,7 @@ def named_places(at: list[str], interfaces: list[str], site: str) -> list[BenchT
 
 
 def places_in_lab(places: list[BenchTarget], lab: LabFleet) -> list[BenchTarget]:
-    """The ports of virtual nodes. Who practices must not reach the devices on a real bench. Raises InputError."""
+    """The ports of virtual nodes. A practice run must not reach the devices on a real bench. Raises InputError."""
     return [_place_in_lab(place, lab) for place in places]
 
 

@@ -168,7 +168,7 @@ def _given_places(opened: Session, at: list[str], interfaces: list[str], site: s
 
 
 def _expected_places(opened: Session, words: list[str], limits: list[str], at: list[BenchTarget]) -> list[BenchTarget]:
-    """Which node is expected at which place."""
+    """The places, each with the node expected there."""
     selected = selected_nodes(opened.fleet, words, limits, in_word_order=True) if words or limits else ()
     expected = [node.name for node in selected]
     if opened.lab is not None and not at:
@@ -197,7 +197,7 @@ def replace(
         typer.Option(
             "--at",
             metavar="HOST",
-            help="Address of the new device if not its own: HOST or HOST:PORT; in a lab a virtual node.",
+            help="Address of the new device, if it is not the spare's own: HOST or HOST:PORT; in a lab a virtual node.",
         ),
     ] = "",
     interface: Annotated[
@@ -219,7 +219,7 @@ def replace(
     key: KeyFiles = None,
     lab: Lab = None,
 ) -> None:
-    """Replace a failed node: the new device gets its name, address and role, the inventory the new MAC and label.
+    """Replace a failed node: the new device gets its name, address and role; its MAC and label go into the inventory.
 
     Example: meshctl replace husky1-b03 spare2
     """
@@ -378,7 +378,7 @@ def _identity_changes(
         for word in ("mac", "serial", "label"):
             if editor.has(("nodes", spare.name, word)):
                 editor.remove(("nodes", spare.name, word))
-    # those of the old device: another device may have them one day, and this one's are observed
+    # the old device's values: another device may have them one day, and this one's are observed
     for radio in node.radios:
         if editor.has(("nodes", node.name, "radios", radio.name, "mac")):
             editor.remove(("nodes", node.name, "radios", radio.name, "mac"))

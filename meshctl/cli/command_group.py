@@ -29,7 +29,7 @@ class Command(TyperCommand):
             raise
 
 
-# of pydantic, which newer typers check values with
+# pydantic's messages: newer typers check values with it
 _WORDINGS = {
     "Value error, ": "",
     "Input should be a valid integer.*": "expected a whole number",

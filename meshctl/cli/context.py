@@ -302,7 +302,7 @@ def with_options(
 
         parameters = [*own, *shared]
         run_command.__name__, run_command.__doc__ = command.__name__, command.__doc__
-        # what typer reads of a function
+        # the attributes of a function that typer reads
         run_command.__annotations__ = {each.name: each.annotation for each in parameters}
         vars(run_command)["__signature__"] = inspect.Signature(parameters)
         return run_command

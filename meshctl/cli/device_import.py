@@ -138,7 +138,7 @@ def _import_target(
     if new is not None and into is not None:
         raise InputError("--file names a file of an existing inventory, and --new writes a new one: use one of them")
     if state is not None and not state.is_managed:
-        raise InputError(f"--state {state.value}: a device that is there is neither lost nor retired")
+        raise InputError(f"--state {state.value}: a device that answers is neither lost nor retired")
     place = new if new is not None else inventory.resolve() if inventory.is_dir() else inventory.resolve().parent
     options = ImportOptions(
         name=name,

@@ -28,7 +28,7 @@ from meshctl.report.terminal_escapes import clean
 def history(
     run: Annotated[int | None, typer.Argument(help="Run number; shows its nodes and steps.")] = None,
     node: Annotated[
-        str | None, typer.Option("--node", help="Only runs or steps of this node; a name or a pattern.")
+        str | None, typer.Option("--node", help="Only runs or steps of this node: a name or a pattern.")
     ] = None,
     fleet: Annotated[str | None, typer.Option("--fleet", help="Only runs of this fleet.")] = None,
     lab: Annotated[
@@ -37,7 +37,7 @@ def history(
     diff: Annotated[bool, typer.Option("--diff", help="With a run number: show file diffs.")] = False,
     limit: Annotated[int, typer.Option("--limit", "-n", min=1, help="Maximum number of runs.")] = 20,
     follow: Annotated[
-        bool, typer.Option("--follow", "-f", help="Show what happens from now on, until Ctrl-C.")
+        bool, typer.Option("--follow", "-f", help="Show new events as they happen, until Ctrl-C.")
     ] = False,
     as_json: AsJson = False,
 ) -> None:
@@ -68,7 +68,7 @@ def history(
 
 @dataclass(frozen=True, slots=True)
 class _RunFilter:
-    """Which runs are listed; None matches all."""
+    """Selects the runs to list; None matches all."""
 
     node: str | None
     fleet: str | None

@@ -1,4 +1,4 @@
-"""`meshctl history --follow`: what happens in the journal from now on, one line for each beginning, outcome and end.
+"""`meshctl history --follow`: new events in the journal, one line for each start, outcome and end of a run.
 
 The runs in progress -> wait until the journal changes -> the differences. Where operators share a journal, the lines
 are of all of them; a lost database is waited for.
@@ -17,15 +17,15 @@ from meshctl.fleet.journal import Journal, RunRecord
 from meshctl.fleet.outcome import Outcome, Result
 from meshctl.fleet.postgresql import DatabaseLost
 
-# A journal that is waited for so long is read anyway: a process that was killed writes no end.
-LOOK_S = 5.0
-# Runs that are looked at; more do not begin between two looks.
+# The journal is read at least this often: a process that was killed writes no end.
+POLL_S = 5.0
+# Runs that are read each time; more do not begin between two reads.
 _RUNS = 50
 
 
 @dataclass(frozen=True, slots=True)
-class Happening:
-    """Something that happened in a run: `kind` is `began`, `node` or `ended`."""
+class RunEvent:
+    """An event of a run: `kind` is `began`, `node` or `ended`."""
 
     kind: str
     run: RunRecord
@@ -51,56 +51,56 @@ class Happening:
 
 
 def follow(journal: Journal, matches: Callable[[RunRecord], bool], node: str | None, *, as_json: bool) -> None:
-    """Print what happens until interrupted."""
-    for happening in happenings(journal, matches, node):
+    """Print events until interrupted."""
+    for event in run_events(journal, matches, node):
         if as_json:
-            echo_json(json.dumps(happening.as_json()))
+            echo_json(json.dumps(event.as_json()))
         else:
-            echo(happening)
+            echo(event)
 
 
-def happenings(
+def run_events(
     journal: Journal,
     matches: Callable[[RunRecord], bool],
     node: str | None,
     *,
     notify: Callable[[str], None] = echo_error,
-) -> Generator[Happening, None, None]:
-    """First the runs in progress, as `began`; then everything that happens. Raises DatabaseLost at the start; later,
-    `notify` is called, and what happened meanwhile follows once the database is back."""
+) -> Generator[RunEvent, None, None]:
+    """First the runs in progress, as `began`; then every new event. Raises DatabaseLost at the start; later, `notify`
+    is called, and the events of the meantime follow once the database is back."""
     journal.wait_for_change(0.0)
     latest = journal.runs(limit=_RUNS)
     last = max((run.id for run in latest), default=0)
-    looks: dict[int, Mapping[str, Result]] = {}
+    known: dict[int, Mapping[str, Result]] = {}
     for run in reversed(latest):
         if matches(run) and not run.is_over:
-            looks[run.id] = _results(_outcomes(journal, run, node))
-            yield Happening("began", run)
+            known[run.id] = _results(_outcomes(journal, run, node))
+            yield RunEvent("began", run)
     is_lost = False
     while True:
         try:
-            journal.wait_for_change(LOOK_S)
-            runs = [run for run in journal.runs(limit=_RUNS) if matches(run) and (run.id > last or run.id in looks)]
+            journal.wait_for_change(POLL_S)
+            runs = [run for run in journal.runs(limit=_RUNS) if matches(run) and (run.id > last or run.id in known)]
             changed = [(run, _outcomes(journal, run, node)) for run in reversed(runs)]
         except DatabaseLost as error:
             if not is_lost:
                 notify(f"warning: {error}; waiting until it is back")
             is_lost = True
-            time.sleep(LOOK_S)
+            time.sleep(POLL_S)
             continue
         is_lost = False
         for run, outcomes in changed:
-            if run.id not in looks:
-                looks[run.id] = {}
-                yield Happening("began", run)
+            if run.id not in known:
+                known[run.id] = {}
+                yield RunEvent("began", run)
             for outcome in outcomes:
-                if outcome.result not in (Result.PENDING, looks[run.id].get(outcome.node)):
-                    yield Happening("node", run, outcome)
-            looks[run.id] = _results(outcomes)
+                if outcome.result not in (Result.PENDING, known[run.id].get(outcome.node)):
+                    yield RunEvent("node", run, outcome)
+            known[run.id] = _results(outcomes)
             if run.is_over:
-                del looks[run.id]
+                del known[run.id]
                 last = max(last, run.id)
-                yield Happening("ended", run)
+                yield RunEvent("ended", run)
 
 
 def _outcomes(journal: Journal, run: RunRecord, node: str | None) -> list[Outcome]:

@@ -72,7 +72,7 @@ def list_nodes(
     robot: Annotated[str, typer.Option("--robot", help="Only nodes on this robot.")] = "",
     as_json: AsJson = False,
 ) -> None:
-    """List nodes with role, state, address, mesh and robot, also lost and retired ones.
+    """List nodes with role, state, address, mesh and robot, including lost and retired ones.
 
     Example: meshctl inventory list robot:husky1 --state carried
     """

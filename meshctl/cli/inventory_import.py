@@ -70,7 +70,7 @@ def import_netbox(
     dry_run: DryRun = False,
     as_json: AsJson = False,
 ) -> None:
-    """Take over names, asset tags, serial numbers, MAC and primary addresses of NetBox's devices.
+    """Import the names, asset tags, serial numbers, MAC and primary addresses of NetBox's devices.
 
     The API token is in $NETBOX_TOKEN. Needs pynetbox, the extra `netbox`.
 

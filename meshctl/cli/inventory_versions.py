@@ -1,4 +1,4 @@
-"""What changes with every edit of an inventory: commands that run for hours read it again."""
+"""Values that follow every edit of the inventory, for commands that run for hours."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from meshctl.diagnostics import InvalidInput
 from meshctl.errors import InputError
 from meshctl.inventory.load import load_fleet
 from meshctl.model import Fleet
-from meshctl.nodes.link_looks import carried_beacons
+from meshctl.nodes.link_snapshots import carried_beacons
 
 
 def versions(fleet: Fleet) -> tuple[tuple[int, int] | None, ...]:

@@ -106,8 +106,8 @@ def run_context(
     observed: Mapping[str, Observation] = MappingProxyType({}),
     rate_bytes_per_s: float | None = None,
 ) -> RunContext:
-    """What all nodes of a run share. The neighbors of the nodes in `seen` are observed first; `observed` holds
-    observations already made."""
+    """The context that all nodes of a run share. The neighbors of the nodes in `seen` are observed first; `observed`
+    holds observations already made."""
     from meshctl.apply.context import RunContext
     from meshctl.apply.neighbor_query import observe_neighbors
     from meshctl.apply.prepare import base_macs

@@ -67,7 +67,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         _print_error(error)
         sys.exit(int(error.exit_code))
     except OSError as error:
-        # of a stream; files have names
+        # an error of a stream; files have names
         if error.errno not in _DISK_FULL or error.filename is not None:
             raise
         discard_output()

@@ -24,7 +24,7 @@ from meshctl.cli.output import echo, echo_json
 from meshctl.cli.voice import Voice
 from meshctl.errors import ExitCode, InputError
 from meshctl.inventory.suggest import did_you_mean
-from meshctl.nodes.link_looks import HopMargins, LinkWatch, assemble, own_radios
+from meshctl.nodes.link_snapshots import HopMargins, LinkPoller, assemble, own_radios
 from meshctl.placement.margin import MAX_SHARED_HOPS, required_snr_db
 from meshctl.placement.meter import Meter, Position, Reading
 from meshctl.placement.reading import is_due_to_speak, line, page, reading_json, style_of, words
@@ -87,10 +87,10 @@ def meter(
     voice = Voice() if speak else None
     # a path of beacons soon has as many hops
     needed_db = required_snr_db(load, MAX_SHARED_HOPS)
-    watch = _watch_of(fleet_view, robot)
+    poller = _poller_of(fleet_view, robot)
     source = _ReadingSource(
         robot,
-        watch,
+        poller,
         Meter(needed_db),
         HopMargins(needed_db),
         _Positions(fleet_view, robot, local),
@@ -116,7 +116,7 @@ def meter(
     raise typer.Exit(ExitCode.INTERRUPTED)
 
 
-def _watch_of(fleet_view: FleetView, robot: str) -> LinkWatch:
+def _poller_of(fleet_view: FleetView, robot: str) -> LinkPoller:
     """The robot's radios and their base, with the addresses of every node that answers or was seen before."""
     fleet = fleet_view.fleet
     own = own_radios(fleet, robot)
@@ -131,7 +131,7 @@ def _watch_of(fleet_view: FleetView, robot: str) -> LinkWatch:
     if base in own:
         raise InputError(f"{robot} is the base: choose a robot that carries beacons")
     macs = collect(fleet_view, robots=()).macs
-    return LinkWatch(fleet, fleet_view.opened.access, own, macs, base.name, time.time)
+    return LinkPoller(fleet, fleet_view.opened.access, own, macs, base.name, time.time)
 
 
 @dataclass(slots=True)
@@ -179,7 +179,7 @@ class _ReadingSource:
     """One reading a second, passed on to the daemon, the robot and the loudspeaker."""
 
     robot: str
-    watch: LinkWatch
+    poller: LinkPoller
     meter: Meter
     margins: HopMargins
     positions: _Positions
@@ -207,19 +207,19 @@ class _ReadingSource:
 
     def step(self) -> Reading:
         """Ask, wait a moment for the answers, and judge."""
-        self.watch.ask()
+        self.poller.ask()
         # the first answers need connections; later ones take a fraction of a second
         deadline = time.monotonic() + (10.0 if not self._steps else 0.7)
-        while self.watch.own_taken_s() <= self._seen_s and time.monotonic() < deadline:
-            if not self._steps and self.watch.problem():
+        while self.poller.own_taken_s() <= self._seen_s and time.monotonic() < deadline:
+            if not self._steps and self.poller.problem():
                 break
             time.sleep(0.02)
         self._steps += 1
-        taken_s = self.watch.own_taken_s()
+        taken_s = self.poller.own_taken_s()
         fresh, self._seen_s = taken_s > self._seen_s, taken_s
         position, heading_rad = self.positions.now()
-        look = assemble(
-            self.watch.mesh(),
+        snapshot = assemble(
+            self.poller.mesh(),
             self.margins,
             time.time(),
             fresh=fresh,
@@ -228,7 +228,7 @@ class _ReadingSource:
             beacons=self.stock(),
             spacing_m=self.spacing_m,
         )
-        reading = self.meter.step(look)
+        reading = self.meter.step(snapshot)
         self._count_bytes()
         self._publish(reading)
         self._speak(reading)
@@ -241,7 +241,7 @@ class _ReadingSource:
     def footer(self) -> str:
         """The airtime cost of the queries, and the latest problem."""
         cost = "?" if self.bytes_per_s is None else f"{self.bytes_per_s / 1000:.1f}"
-        problem = self.watch.problem() or self.note or self.sound_problem
+        problem = self.poller.problem() or self.note or self.sound_problem
         return f"queries cost {cost} kB/s on the air; Ctrl-C to quit{f'; {problem}' if problem else ''}"
 
     def _count_bytes(self) -> None:

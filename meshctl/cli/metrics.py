@@ -38,7 +38,7 @@ def metrics(
     key: KeyFiles = None,
     lab: Lab = None,
 ) -> None:
-    """Print one snapshot of the fleet in Prometheus' text format; `meshctl monitor` serves the same at /metrics.
+    """Print one snapshot of the fleet in Prometheus's text format; `meshctl monitor` serves the same at /metrics.
 
     With --store, the newest frame of a monitor's history is printed, and no device is queried.
 

@@ -80,13 +80,13 @@ def monitor(
     tls_certificate: Annotated[Path | None, typer.Option("--tls-cert", help="Certificate chain, PEM.")] = None,
     tls_key: Annotated[Path | None, typer.Option("--tls-key", help="Its private key, PEM.")] = None,
     host_name: Annotated[
-        list[str] | None, typer.Option("--host-name", help="Name by which browsers may reach the page; repeatable.")
+        list[str] | None, typer.Option("--host-name", help="Host name by which browsers may reach it; repeatable.")
     ] = None,
     allow_actions: Annotated[
         bool,
         typer.Option("--allow-actions", help="Let the page provision, reboot, and mark beacons, with confirmation."),
     ] = False,
-    webhook: Annotated[str, typer.Option("--webhook", metavar="URL", help="POST each new alarm there, as JSON.")] = "",
+    webhook: Annotated[str, typer.Option("--webhook", metavar="URL", help="POST each new alarm to URL as JSON.")] = "",
     hook: Annotated[
         str, typer.Option("--hook", metavar="COMMAND", help="Run for each new alarm, with its JSON as input.")
     ] = "",
@@ -127,10 +127,10 @@ def monitor(
     key: KeyFiles = None,
     lab: Lab = None,
 ) -> None:
-    """Watch the fleet and serve a page with the mesh, robots and alarms, live and back in time. Ctrl-C ends it.
+    """Watch the fleet and serve a page with the mesh, robots and alarms, live and recorded. Ctrl-C ends it.
 
-    The page listens on this machine only. On another address it needs a token, which is made and printed if none is
-    given, or a TLS certificate. It changes nothing without --allow-actions.
+    The page listens on this machine only. On another address it needs a TLS certificate or a token, which is generated
+    and printed if none is given. It changes nothing without --allow-actions.
 
     Exit code: 0 ended by SIGTERM, 130 by Ctrl-C, 2 could not run; with --once that of `meshctl status`.
 

@@ -18,7 +18,7 @@ TIMEOUT_S = 60.0
 _DEVICES_PER_QUERY = 50
 _HINTS = {
     401: "check NETBOX_TOKEN",
-    403: "check NETBOX_TOKEN and what it permits",
+    403: "check NETBOX_TOKEN and its permissions",
     404: "give the address of NetBox's start page, without /api",
     429: "try again later",
 }
@@ -58,7 +58,7 @@ def fetch(
     except requests.exceptions.RequestException as error:
         asked = "" if error.request is None else str(error.request.url or "")
         where = (
-            "" if not asked or asked.startswith(url) else f" from {asked.partition('?')[0]}, to which {url} referred"
+            "" if not asked or asked.startswith(url) else f" from {asked.partition('?')[0]}, to which {url} redirected"
         )
         raise Unreachable(f"{url}: no answer{where}: {type(error).__name__}") from error
     return devices, interfaces

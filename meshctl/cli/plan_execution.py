@@ -17,7 +17,7 @@ from meshctl.cli.context import Session, confirm, line_width, selected_nodes
 from meshctl.cli.journaled_run import JournaledRun, journaled_run, print_totals, retry_command, run_context
 from meshctl.cli.output import console, echo_json
 from meshctl.cli.query_line import query_line
-from meshctl.cli.site_files import at_site, replaced_by
+from meshctl.cli.site_files import replaced_by, runs_at_site
 from meshctl.errors import ExitCode, MeshctlError
 from meshctl.fleet import Outcome
 from meshctl.fleet.run_files import BEFORE, CHANGES, RunFiles
@@ -54,7 +54,7 @@ def choices_of(
 def _acknowledged(fleet: Fleet, text: str) -> tuple[str, ...]:
     """The nodes that an option selects, or `all`."""
     words = tuple(part.strip() for part in text.split(",") if part.strip())
-    if not words or ALL in words or at_site():
+    if not words or ALL in words or runs_at_site():
         # a site gets names, also those of other sites, which its part of the inventory may lack
         return (ALL,) if ALL in words else words
     return tuple(node.name for node in selected_nodes(fleet, words, with_unmanaged=True))
@@ -191,7 +191,7 @@ def save_before(opened: Session, run: JournaledRun, changing: Iterable[NodePlan]
     try:
         files.discard(run.entry.id)
         files.save(run.entry.id, CHANGES, changes)
-        if not at_site():
+        if not runs_at_site():
             files.save(run.entry.id, BEFORE, replaced)
     except MeshctlError as error:
         # a full disk must not prevent the run

@@ -16,7 +16,7 @@ from meshctl.errors import ExitCode, InputError
 from meshctl.placement.margin import UNMEASURED_FADE_DB
 from meshctl.placement.path_loss import PathLossModel, Point, RadioModel, Wall
 from meshctl.placement.picture import MapView, png, summary, svg
-from meshctl.placement.planner import PlacementPlan, Rock, Terrain, Walls, plan
+from meshctl.placement.planner import MappedTerrain, PlacementPlan, Terrain, Walls, plan
 
 VERSION = 1
 _WALL_DB = 12.0
@@ -52,7 +52,7 @@ def plan_placement(
 
     The route begins at the base. On an occupancy map, the way between two points leads through free space.
 
-    Exit code: 0 the whole route has the margin, 1 not all of it has, 2 could not run.
+    Exit code: 0 the whole route has the margin, 1 part of it does not, 2 could not run.
 
     Example: meshctl plan-placement ground.yaml base 240,0 240,-60 --svg plan.svg
 
@@ -89,7 +89,7 @@ def _read(
         stops = occupancy.way(tuple(_point(word, {}) for word in route))
         model = PathLossModel() if exponent is None else PathLossModel(exponent=exponent)
         wall = Wall(stops[0], stops[0], loss_db=wall_loss)
-        return Rock(occupancy, wall), model, stops, MapView(occupancy=occupancy)
+        return MappedTerrain(occupancy, wall), model, stops, MapView(occupancy=occupancy)
     found = ground.load(map_file)
     air = found.air
     if exponent is not None:

@@ -7,13 +7,13 @@ outcome per robot. Topics and keys, which also change the inventory, are in robo
 from __future__ import annotations
 
 import json
-import sys
 import time
 from typing import Annotated
 
 import typer
 
 from meshctl.cli.context import DryRun, exit_for, line_width
+from meshctl.cli.key_pinning import pin_host_key
 from meshctl.cli.output import echo, echo_json
 from meshctl.cli.robots_context import SERVICE_TIMEOUT_S, RobotsContext, finish, run_command, with_robots_context
 from meshctl.cli.robots_dry_run import (
@@ -183,29 +183,14 @@ def trust_command(
 
 
 def _pin_key(context: RobotsContext, robot: str, *, change: bool, yes: bool, dry_run: bool) -> bool:
-    """Show, confirm and pin the key; whether it is pinned in the end, or would be with `dry_run`."""
-    name = context.connector.endpoint(robot).identity
     try:
         shown = context.connector.presented_key(robot)
     except NodeError as error:
         echo(f"{robot}: {error}" + (f"\n  hint: {error.hint}" if error.hint else ""))
         return False
     assert shown is not None, "a completed handshake presents a key"
-    pinned = context.opened.trust.pinned(name)
-    line = f"{robot}: {shown.fingerprint} ({shown.key_type})"
-    if shown in pinned:
-        echo(f"{line}: pinned")
-        return True
-    if pinned and not change:
-        echo(f"{line}: DIFFERS from the pinned {', '.join(host_key.fingerprint for host_key in pinned)}")
-        echo("  hint: another computer, a new installation, or an attack: verify, then use --replace")
-        return False
-    if dry_run:
-        echo(f"{line}: would be pinned" + (" instead of the pinned key" if pinned else ""))
-        return True
-    if yes or (sys.stdin.isatty() and typer.confirm(f"{line}\n  Does this match the fingerprint on the computer?")):
-        context.opened.trust.replace(name, shown)
-        echo(f"{line}: pinned now")
-        return True
-    echo(f"{line}: not pinned")
-    return False
+    name = context.connector.endpoint(robot).identity
+    trust = context.opened.trust
+    return pin_host_key(
+        trust, name, shown, label=robot, device="computer", may_replace=change, yes=yes, dry_run=dry_run
+    )

@@ -62,7 +62,7 @@ def rollback(
     key: KeyFiles = None,
     lab: Lab = None,
 ) -> None:
-    """Return nodes to their configuration from before a run, planned, confirmed and proven as by `provision`.
+    """Restore the configuration that nodes had before a run. Planned, confirmed and proven like `provision`.
 
     The inventory is not changed: revert your edit there, or the next `provision` applies it again.
 

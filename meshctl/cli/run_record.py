@@ -15,12 +15,12 @@ def run_of(journal: Journal, fleet: str, number: int) -> RunRecord:
     if record is None:
         raise InputError(f"run {number} does not exist", hint="run `meshctl history` to list all runs")
     if record.fleet != fleet:
-        raise InputError(f"run {number} is one of fleet {record.fleet}: expected one of fleet {fleet}")
+        raise InputError(f"run {number} belongs to fleet {record.fleet}, not to {fleet}")
     if record.lab and record.lab != journal.lab:
-        raise InputError(f"run {number} is one of the lab in {record.lab}", hint=f"add `--lab {record.lab}`")
+        raise InputError(f"run {number} belongs to the lab in {record.lab}", hint=f"add `--lab {record.lab}`")
     if journal.lab and not record.lab:
         raise InputError(
-            f"run {number} is one of the real fleet, and $MESHCTL_LAB or --lab names the lab in {journal.lab}",
+            f"run {number} belongs to the real fleet, but $MESHCTL_LAB or --lab selects the lab in {journal.lab}",
             hint="unset MESHCTL_LAB, and omit --lab",
         )
     if not record.is_over:

@@ -21,7 +21,7 @@ from meshctl.plan import Verdict
 from meshctl.sites.part import EARLIER_FILE, FILES_VARIABLE, REPLACED_FILE
 
 
-def at_site() -> bool:
+def runs_at_site() -> bool:
     """Whether a worker has started this command."""
     return bool(os.environ.get(FILES_VARIABLE))
 

@@ -98,7 +98,7 @@ class WholePlan:
         return direct | {name: state for site in self.sites for name, state in site.replaced.items()}
 
     def saved(self, opened: Session, choices: PlanOptions) -> SavedSitePlans:
-        """What a file of these plans has."""
+        """These plans, as saved in a file."""
         direct = self.direct
         return SavedSitePlans(
             opened.fleet.name,
@@ -157,7 +157,7 @@ def prepare_saved(opened: Session, inventory: Path, saved: SavedSitePlans, file:
 
 
 def _bundles(opened: Session, inventory: Path, choices: PlanOptions) -> Callable[[str], SiteBundle]:
-    """The bundle of a site by its name. Of a rollback it has the earlier states of the site's own nodes."""
+    """The bundle of a site by its name. For a rollback, it includes the earlier states of the site's own nodes."""
     renderer, nodes = opened.renderer, opened.fleet.nodes
     states = renderer.states if isinstance(renderer, EarlierStates) else {}
 

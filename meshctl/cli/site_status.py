@@ -49,7 +49,7 @@ class SiteStatus:
         return ExitCode(int(self.nodes.get("exit_code", ExitCode.OK)))
 
 
-def look(opened: Session, inventory: Path, sites: tuple[Site, ...], *, with_nodes: bool) -> list[SiteStatus]:
+def query_sites(opened: Session, inventory: Path, sites: tuple[Site, ...], *, with_nodes: bool) -> list[SiteStatus]:
     """Ask all sites at the same time."""
 
     def ask(site: Site) -> SiteStatus:

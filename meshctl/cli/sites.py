@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import sys
 import tempfile
 import time
 from collections.abc import Iterable
@@ -16,8 +15,9 @@ import typer
 
 from meshctl import __version__
 from meshctl.cli.context import AsJson, DryRun, InventoryPath, KeyFiles, Lab, Session, session
+from meshctl.cli.key_pinning import pin_host_key
 from meshctl.cli.output import echo, echo_json
-from meshctl.cli.site_status import as_object, exit_code, look, show
+from meshctl.cli.site_status import as_object, exit_code, query_sites, show
 from meshctl.device.errors import AuthenticationRefused
 from meshctl.device.trust import AcceptAnyKey, HostKey
 from meshctl.device.upload import UploadProgress
@@ -74,7 +74,7 @@ def status_command(
     Example: meshctl sites status --nodes
     """
     with session(inventory, key_files=key or (), lab=lab) as opened:
-        found = look(opened, inventory, selected_sites(opened, sites), with_nodes=nodes)
+        found = query_sites(opened, inventory, selected_sites(opened, sites), with_nodes=nodes)
     if as_json:
         echo_json(json.dumps([as_object(each) for each in found], indent=1))
     else:
@@ -94,9 +94,10 @@ def install_command(
     key: KeyFiles = None,
     lab: Lab = None,
 ) -> None:
-    """Install or update meshctl on the gateways, give each a key of its own, and write that key into the inventory.
+    """Install or update meshctl on the gateways, generate a key on each, and write its public part into the inventory.
 
-    Needs Python 3.11 there, and neither root nor the internet. Only the operators in the inventory may give orders.
+    The gateways need Python 3.11, but neither root nor internet access. Only the operators in the inventory may give
+    orders.
 
     Example: meshctl sites install north --wheels wheels/
     """
@@ -241,23 +242,7 @@ def _pin(opened: Session, site: Site, *, may_replace: bool, yes: bool) -> bool:
         echo(f"{site.name}: {error}" + (f"\n  hint: {error.hint}" if error.hint else ""))
         return False
     name = f"{PIN_PREFIX}{site.name}"
-    pinned = opened.trust.pinned(name)
-    line = f"{site.name}: {shown.fingerprint} ({shown.key_type})"
-    if shown in pinned:
-        echo(f"{line}: pinned")
-        return True
-    if pinned and not may_replace:
-        echo(f"{line}: DIFFERS from the pinned {', '.join(host_key.fingerprint for host_key in pinned)}")
-        echo("  hint: another computer, a new installation, or an attack: verify, then use --replace")
-        return False
-    if yes or (sys.stdin.isatty() and typer.confirm(f"{line}\n  Does this match the fingerprint on the gateway?")):
-        opened.trust.replace(name, shown)
-        echo(f"{line}: pinned now")
-        return True
-    echo(f"{line}: not pinned")
-    if not sys.stdin.isatty():
-        echo("  hint: not a terminal: cannot ask; compare the fingerprint with the gateway's, then pass --yes")
-    return False
+    return pin_host_key(opened.trust, name, shown, label=site.name, device="gateway", may_replace=may_replace, yes=yes)
 
 
 def _presented_key(opened: Session, site: Site) -> HostKey:

@@ -28,6 +28,7 @@ from meshctl.cli.context import (
     selected_nodes,
     session,
 )
+from meshctl.cli.key_pinning import pin_host_key
 from meshctl.cli.output import echo, echo_bytes, echo_error, echo_json
 from meshctl.device.framing import command_line
 from meshctl.errors import ExitCode, InputError
@@ -52,7 +53,7 @@ def trust(
 ) -> None:
     """Show the nodes' host key fingerprints and pin them in the fleet's known_hosts after confirmation.
 
-    Exit code: 0 if all keys are pinned (with --dry-run: or would be), 1 if not, 3 if no node answers.
+    Exit code: 0 if all keys are pinned (with --dry-run: would be), 1 if not, 3 if no node answers.
 
     Example: meshctl trust b03
     """
@@ -83,38 +84,22 @@ def _key_object(item: HostKeyState) -> dict[str, str]:
 
 
 def _pin_key(opened: Session, item: HostKeyState, *, may_replace: bool, yes: bool, dry_run: bool, quiet: bool) -> bool:
-    """Show, confirm and pin the key; whether it is pinned in the end, or would be in a dry run."""
-
-    def say(text: str) -> None:
-        if not quiet:
-            echo(text)
-
     name = item.node.name
     if item.key is None:
-        say(f"{name}: {item.error}")
+        if not quiet:
+            echo(f"{name}: {item.error}")
         return False
-    line = f"{name}: {item.key.fingerprint} ({item.key.key_type})"
-    if item.is_pinned:
-        say(f"{line}: pinned")
-        return True
-    if item.is_changed:
-        say(f"{line}: DIFFERS from the pinned {', '.join(item.pinned)}")
-        if not may_replace:
-            say("  hint: another device, a reflash outside meshctl, or an attack: verify, then use --replace")
-            return False
-    else:
-        say(f"{line}: not pinned")
-    if dry_run:
-        say("  would be pinned after confirmation")
-        return True
-    if not yes:
-        if quiet or not sys.stdin.isatty():
-            return False
-        if not typer.confirm("  Does this match the fingerprint on the node?"):
-            return False
-    opened.trust.replace(name, item.key)
-    say(f"{line}: pinned now")
-    return True
+    return pin_host_key(
+        opened.trust,
+        name,
+        item.key,
+        label=name,
+        device="node",
+        may_replace=may_replace,
+        yes=yes,
+        dry_run=dry_run,
+        quiet=quiet,
+    )
 
 
 def run(

@@ -64,7 +64,7 @@ def status(
     wide: Annotated[bool, typer.Option("--wide", help="Show all columns regardless of the terminal width.")] = False,
     as_json: AsJson = False,
     answers: Annotated[
-        bool, typer.Option("--answers", hidden=True, help="Print what the radios say, for another meshctl to read.")
+        bool, typer.Option("--answers", hidden=True, help="Print the radios' raw answers, for another meshctl to read.")
     ] = False,
 ) -> None:
     """Show the state of every radio and robot: reachability, drift from the inventory, neighbors and alarms.
@@ -98,7 +98,7 @@ def status(
 
 
 class _StatusQuery:
-    """Which part of the fleet is queried, and how it is shown."""
+    """Selects the part of the fleet to query, and how to show it."""
 
     def __init__(self, fleet_view: FleetView, chosen: Filter, only: bool, topics: bool, wide: bool) -> None:
         self._fleet_view = fleet_view

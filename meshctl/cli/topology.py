@@ -85,7 +85,7 @@ def topology(
     if not snapshot.observations:
         is_new = bool(queried) and all(node.age_s is None for node in found.nodes)
         why = (
-            "no node was ever seen; run `meshctl bootstrap` to set up factory-default devices"
+            "no node has ever answered; run `meshctl bootstrap` to set up factory-default devices"
             if is_new
             else "run `meshctl status` for the reason"
         )

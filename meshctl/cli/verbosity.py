@@ -74,7 +74,7 @@ def _recording(verbose: int, log_file: Path | None) -> Iterator[None]:
             stack.callback(event_log.remove_handler, handler)
         began = time.monotonic()
         words = sys.argv[1:]
-        # what follows `--` is for a device: the event of its execution has it, with secrets masked
+        # words after `--` are for a device: the event of their execution has them, with secrets masked
         own = words[: words.index("--")] if "--" in words else words
         event_log.emit(event_log.INFO, "began", arguments=" ".join(own))
         code, error = int(ExitCode.OK), None

@@ -19,9 +19,7 @@ def worker(
     ] = False,
     nats: Annotated[str, typer.Option("--nats", metavar="URL", help="Serve permanently at this NATS leaf node.")] = "",
     hub: Annotated[str, typer.Option("--hub", metavar="DOMAIN", help="JetStream domain of the hub.")] = "hub",
-    execute: Annotated[
-        str, typer.Option("--execute", metavar="RUN", help="Execute a run that was ordered, to its end.")
-    ] = "",
+    execute: Annotated[str, typer.Option("--execute", metavar="RUN", help="Execute an ordered run to its end.")] = "",
 ) -> None:
     """Serve a site: plan and execute changes of its nodes for operators, who connect over SSH or NATS.
 

@@ -109,7 +109,7 @@ def keepalives(transport: paramiko.Transport, every_s: float, idle_s: float) -> 
 
 class Watchdog:
     """Closes `transport` when this block takes longer than `seconds` (`timed_out`), or when `activity` shows no data
-    for `silence_s` (`silent`). All of them share one thread (`_Patrol`)."""
+    for `silence_s` (`silent`). All of them share one thread (`_WatchdogThread`)."""
 
     def __init__(
         self,
@@ -153,18 +153,18 @@ class Watchdog:
 
     def __enter__(self) -> Watchdog:
         self._began_s = time.monotonic()
-        _PATROL.add(self, self._began_s)
+        _WATCHDOG_THREAD.add(self, self._began_s)
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        _PATROL.end(self)
+        _WATCHDOG_THREAD.end(self)
 
 
-class _Patrol:
-    """Checks every watchdog when it is due, in one daemon thread that starts with the first: a look at 200 nodes would
-    start 800, with one for each phase of each connection. Thread-safe."""
+class _WatchdogThread:
+    """Checks every watchdog when it is due, in one daemon thread that starts with the first watchdog. With a thread for
+    each phase of each connection, an observation of 200 nodes would start 800. Thread-safe."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
@@ -179,7 +179,7 @@ class _Patrol:
             self._put(watchdog, now_s)
             if not self._is_started:
                 self._is_started = True
-                threading.Thread(target=self._walk, name="watchdogs", daemon=True).start()
+                threading.Thread(target=self._run, name="watchdogs", daemon=True).start()
 
     def end(self, watchdog: Watchdog) -> None:
         with self._changed:
@@ -198,7 +198,7 @@ class _Patrol:
         if self._due[0][2] is watchdog:
             self._changed.notify()
 
-    def _walk(self) -> None:
+    def _run(self) -> None:
         with self._changed:
             while True:
                 now_s = time.monotonic()
@@ -209,4 +209,4 @@ class _Patrol:
                 self._changed.wait(self._due[0][0] - now_s if self._due else None)
 
 
-_PATROL = _Patrol()
+_WATCHDOG_THREAD = _WatchdogThread()

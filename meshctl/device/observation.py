@@ -205,7 +205,7 @@ class MeshInfo:
 
 
 @dataclass(frozen=True, slots=True)
-class MeshNeighbour:
+class MeshNeighbor:
     """One direct neighbor of batman-adv (`neighbors_json` or `batctl n`)."""
 
     mac: str
@@ -315,7 +315,7 @@ class Observation:
     lan_filter: LanFilterCounts | None = None
     """None: the node has no LAN filter, or has not loaded it."""
     mesh: MeshInfo | None = None
-    neighbours: tuple[MeshNeighbour, ...] | None = None
+    neighbors: tuple[MeshNeighbor, ...] | None = None
     originators: tuple[Originator, ...] | None = None
     mesh_statistics: Mapping[str, Mapping[str, int]] | None = None
     """Interface of batman-adv -> its counters (`batctl statistics`)."""

@@ -21,7 +21,7 @@ from meshctl.device.observation import (
     ChannelSurvey,
     FileInfo,
     MeshInfo,
-    MeshNeighbour,
+    MeshNeighbor,
     MeshTableSizes,
     Observation,
     Originator,
@@ -144,7 +144,7 @@ def interpret(sections: Mapping[str, OutputSection], *, asked_at_s: float, answe
     board, release = _board(reader)
     space = reader.read("df", system.parse_df) or {}
     links, stations, surveys = _wireless(reader)
-    mesh, neighbours, originators, tables = _mesh(reader)
+    mesh, neighbors, originators, tables = _mesh(reader)
     macs = reader.read("macs", system.parse_macs)
     indexes = reader.read("macs", system.parse_indexes, required=False) or {}
     has_tool = not reader.found_nothing("package_tool")
@@ -178,7 +178,7 @@ def interpret(sections: Mapping[str, OutputSection], *, asked_at_s: float, answe
         bridges=reader.read("bridges", system.parse_bridges),
         lan_filter=reader.read("lan_filter", nft.parse_lan_filter, required=False),
         mesh=mesh,
-        neighbours=neighbours,
+        neighbors=neighbors,
         originators=originators,
         mesh_statistics=_statistics(reader),
         mesh_tables=tables,
@@ -255,43 +255,43 @@ def _mesh(
     reader: _OutputReader,
 ) -> tuple[
     MeshInfo | None,
-    tuple[MeshNeighbour, ...] | None,
+    tuple[MeshNeighbor, ...] | None,
     tuple[Originator, ...] | None,
     Mapping[str, MeshTableSizes] | None,
 ]:
-    """Of all batman-adv interfaces together, and the sizes of each one's tables; all None without any."""
+    """Facts of all batman-adv interfaces together, and the sizes of each one's tables; all None without any."""
     names = reader.names("batctl.originators_json")
     if not names:
         return None, None, None, None
     info: MeshInfo | None = None
     hard: list[tuple[str, ...] | None] = []
     known = reader.read("macs", system.parse_indexes, required=False) or {}
-    neighbours: list[MeshNeighbour] | None = None
+    neighbors: list[MeshNeighbor] | None = None
     originators: list[Originator] | None = None
     tables: dict[str, MeshTableSizes] = {}
     for name in names:
         as_text = reader.status(f"batctl.originators {name}") is not None
         if as_text:
             header = reader.read(f"batctl.originators {name}", batctl.parse_mesh_header)
-            near = reader.read(f"batctl.neighbors {name}", batctl.parse_neighbours_text)
+            near = reader.read(f"batctl.neighbors {name}", batctl.parse_neighbors_text)
             far = reader.read(f"batctl.originators {name}", batctl.parse_originators_text)
             hard.append(reader.read(f"batctl.interface {name}", batctl.parse_interfaces_text))
         else:
             header = reader.read(f"batctl.mesh_json {name}", batctl.parse_mesh_json)
-            near = reader.read(f"batctl.neighbors_json {name}", lambda text: batctl.parse_neighbours_json(text, known))
+            near = reader.read(f"batctl.neighbors_json {name}", lambda text: batctl.parse_neighbors_json(text, known))
             far = reader.read(
                 f"batctl.originators_json {name}", lambda text: batctl.parse_originators_json(text, known)
             )
             hard.append(reader.read(f"batctl.hardifs_json {name}", lambda text: batctl.parse_hardifs_json(text, known)))
         info = info or header
-        neighbours = (neighbours or []) + list(near) if near is not None else neighbours
+        neighbors = (neighbors or []) + list(near) if near is not None else neighbors
         originators = (originators or []) + list(far) if far is not None else originators
         tables[name] = _table_sizes(
             far, reader.read(f"batctl.transglobal {name}", batctl.parse_transglobal, required=False)
         )
     return (
         None if info is None else replace(info, hard_interfaces=_all(hard)),
-        None if neighbours is None else tuple(neighbours),
+        None if neighbors is None else tuple(neighbors),
         None if originators is None else tuple(originators),
         MappingProxyType(tables),
     )

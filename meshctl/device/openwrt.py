@@ -1,7 +1,7 @@
 """OpenWrt operations on a node: uptime, files, backup, firmware, reload, reboot.
 
-Each runs one short script over a `Connection`, with absolute paths of the tools that change something. What ends the
-connection (reboot, sysupgrade) is started as a detached process after a delay, so that the answer arrives.
+Each runs one short script over a `Connection`, with absolute paths of the tools that change something. Actions
+that end the connection (reboot, sysupgrade) start as a detached process after a delay, so that the answer arrives.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from enum import Enum
 from meshctl.device.connection import Connection
 from meshctl.device.errors import CommandFailed
 from meshctl.device.framing import quoted
-from meshctl.device.parse.jsontext import mapping, parse_json, truth
+from meshctl.device.parse.jsontext import boolean, mapping, parse_json
 from meshctl.device.parse.system import parse_boot_id, parse_meminfo, parse_uptime
 
 # `sysupgrade -T` unpacks and hashes the image.
@@ -155,14 +155,14 @@ def check_firmware(connection: Connection, image_path: str) -> FirmwareCheck:
     memory = parse_meminfo(done.stdout)
     # procd rejects `-f` for such an image only after `sysupgrade` has started; -T does not check it
     bare = validation.get("allow_backup") is False
-    passed = "status 0" in lines and (not validation or truth(validation.get("valid"))) and not bare
+    passed = "status 0" in lines and (not validation or boolean(validation.get("valid"))) and not bare
     reason = "; ".join(line for line in said if line and not line.startswith(_FORCE_ADVICE)) or "sysupgrade -T failed"
     if bare:
         reason = "it does not accept a configuration from the running system"
     return FirmwareCheck(
         valid=passed,
         reason="" if passed else reason,
-        tests={name: truth(value) for name, value in mapping(validation.get("tests")).items()},
+        tests={name: boolean(value) for name, value in mapping(validation.get("tests")).items()},
         available_bytes=None if memory is None else memory.available,
     )
 

@@ -69,14 +69,14 @@ class Pin:
     marker: str = ""
 
     def covers(self, name: str) -> bool:
-        return any(_hashed_as(own, name) if own.startswith("|1|") else own == name for own in self.names)
+        return any(_is_hash_of(own, name) if own.startswith("|1|") else own == name for own in self.names)
 
     @property
     def line(self) -> str:
         return " ".join(filter(None, (self.marker, ",".join(self.names), self.key.text)))
 
 
-def _hashed_as(pattern: str, name: str) -> bool:
+def _is_hash_of(pattern: str, name: str) -> bool:
     """OpenSSH's HashKnownHosts: `|1|salt|HMAC-SHA1(salt, name)`, both in base64 (hostfile.c)."""
     try:
         salt, digest = (base64.b64decode(part, validate=True) for part in pattern.split("|")[2:])

@@ -24,7 +24,7 @@ from meshctl.errors import MeshctlError
 from meshctl.fleet.alarm_actions import AlarmExchange
 from meshctl.fleet.journal_schema import LAB_SEPARATOR, REMEMBER, SCHEMA
 from meshctl.fleet.outcome import Outcome, Result
-from meshctl.fleet.process import owner, process_lives, runs_here, this_process
+from meshctl.fleet.process import is_process_alive, owner, runs_here, this_process
 from meshctl.fleet.sqlite_file import BUSY_TIMEOUT_S, SqliteFile
 from meshctl.fleet.store import Claim, Statement, Store
 
@@ -63,13 +63,13 @@ class RunRecord:
 
     @property
     def is_over(self) -> bool:
-        return self.ended_s is not None or not process_lives(self.process)
+        return self.ended_s is not None or not is_process_alive(self.process)
 
     @property
     def state(self) -> str:
         if self.ended_s is not None:
             return self.result
-        if not process_lives(self.process):
+        if not is_process_alive(self.process):
             return "interrupted"
         is_here = runs_here(self.process)
         return "under way" if is_here or self.is_connected is not False else "under way, or interrupted: out of contact"

@@ -1,4 +1,4 @@
-"""Which journal this computer uses: its own file, or the database that `MESHCTL_STORE` names.
+"""Choose this computer's journal: its own file, or the database that `MESHCTL_STORE` names.
 
 `open_journal` opens the database and merges what was kept here meanwhile; if it cannot be reached, the file is used and
 its runs are merged later. `notify` receives what the operator has to know about that.

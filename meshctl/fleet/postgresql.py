@@ -265,7 +265,7 @@ class Database:
             if self._listener is None:
                 self._listener = self._connect()
                 self._listener.execute(f"LISTEN {CHANNEL}")
-                # what was written before the first call sent no notification
+                # rows that were written before the first call sent no notification
                 return True
             return any(True for _ in self._listener.notifies(timeout=timeout_s, stop_after=1))
         except psycopg.Error as error:

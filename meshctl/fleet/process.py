@@ -28,7 +28,7 @@ def lock_owner() -> str:
 
 def is_dead(lock: str) -> bool:
     """Whether a lock's owner is a process of this machine that has ended, and so cannot release it."""
-    return bool(lock) and not process_lives(lock.partition("@")[2])
+    return bool(lock) and not is_process_alive(lock.partition("@")[2])
 
 
 def process_of(pid: int) -> str:
@@ -41,7 +41,7 @@ def this_process() -> str:
     return process_of(os.getpid())
 
 
-def process_lives(process: str) -> bool:
+def is_process_alive(process: str) -> bool:
     """Whether a process is still running; one on another host counts as running."""
     name, _, start = process.rpartition(":")
     pid = name.rpartition(":")[2]

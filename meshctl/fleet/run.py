@@ -1,7 +1,7 @@
 """Run a function for every node, one outcome per node.
 
 `run` works on at most `parallel` nodes at a time, in the given order. A node's error becomes its outcome. When the
-failure budget is spent or an interrupt is requested, nodes that have not started end as PENDING; the others finish.
+failure budget is exhausted or an interrupt is requested, nodes that have not started end as PENDING; the others finish.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class FailureBudget:
                 self._failures += 1
 
     @property
-    def spent(self) -> bool:
+    def is_exhausted(self) -> bool:
         return 0 < self._limit <= self._failures
 
     @property
@@ -87,7 +87,7 @@ def run(
 
     with ThreadPoolExecutor(max_workers=parallel, thread_name_prefix="node") as pool:
         while waiting or in_work:
-            while waiting and len(in_work) < parallel and not (signal.stopping or failure_budget.spent or bugs):
+            while waiting and len(in_work) < parallel and not (signal.stopping or failure_budget.is_exhausted or bugs):
                 node = waiting.pop(0)
                 in_work[pool.submit(run_node, node)] = node
             if not in_work:

@@ -21,7 +21,7 @@ from meshctl.errors import MeshctlError
 CHANGES, BEFORE = "changes", "before"
 # the keys of what sites will report as replaced, by the ids of their runs
 REPLY_KEYS = "reply-keys"
-# of the runs of all fleets: some 100 KiB each for a fleet of 60 nodes
+# runs of all fleets whose files are kept: some 100 KiB each for a fleet of 60 nodes
 MAX_BEFORE = 50
 
 

@@ -24,7 +24,7 @@ from typing import Any
 from meshctl.errors import MeshctlError
 from meshctl.fleet.journal_schema import LAB_SEPARATOR, REMEMBER, SCHEMA
 from meshctl.fleet.postgresql import Database, DatabaseLost
-from meshctl.fleet.process import owner, process_lives, this_process
+from meshctl.fleet.process import is_process_alive, owner, this_process
 from meshctl.fleet.run_files import runs_directory
 from meshctl.fleet.sqlite_file import BUSY_TIMEOUT_S, Schema, SqliteFile
 from meshctl.fleet.store import Claim, Statement, Transaction
@@ -249,7 +249,7 @@ class SharedStore:
         if not rows:
             return None
         record = rows[0]
-        if record[7] is None and process_lives(record[4]):
+        if record[7] is None and is_process_alive(record[4]):
             return None
         with self._database.transaction() as transaction:
             columns = ", ".join("?" * (len(record) + 1))

@@ -52,7 +52,7 @@ class ExistingDevice:
 
     @property
     def facts(self) -> DeviceFacts:
-        """What provisioning keeps of the device (`meshctl.render.facts`)."""
+        """Facts of the device that provisioning keeps (`meshctl.render.facts`)."""
         versions = (section.get("compat_version") for section in self.package("system").of_type("system"))
         packages = dict(self.packages)
         if "network" in packages and any("." in port for port in self.lan_ports):

@@ -138,7 +138,7 @@ def _pairs(own: Package, target: Package, sections: Mapping[tuple[str, str], str
 
 
 def _identity(package: str, section: Section, name: str) -> tuple[str, ...]:
-    """What a section is, apart from its name where that is arbitrary."""
+    """The identity of a section, without its name if that is arbitrary."""
     match package, section.type:
         case ("system", "system") | ("dropbear", _) | ("dhcp", "odhcpd" | "dnsmasq") | ("firewall", "defaults"):
             return (section.type,)

@@ -31,8 +31,8 @@ NAME_CHARACTERS = re.compile("[^A-Za-z0-9._-]+")
 
 @dataclass(frozen=True, slots=True)
 class ImportOptions:
-    """What the operator says of the device. `secret_file` gives the path, as the inventory writes it, of the file for
-    the key of the mesh of that name."""
+    """The operator's statements about the device. `secret_file` gives the path, as the inventory writes it, of the file
+    for the key of the mesh of that name."""
 
     name: str = ""
     address: IpInterface | None = None
@@ -50,9 +50,9 @@ class ImportOptions:
 
 @dataclass(frozen=True, slots=True)
 class Entries:
-    """What to set in the inventory, by path in the document's order. `secrets` are the keys for new files, by the path
-    that `values` has; `assumed` are values that the device does not know; `sections` are the names under which meshctl
-    renders the device's sections: (package, name) -> name."""
+    """Values to set in the inventory, by path in the document's order. `secrets` are the keys for new files, by the
+    path that `values` has; `assumed` are values that the device does not know; `sections` are the names under which
+    meshctl renders the device's sections: (package, name) -> name."""
 
     name: str
     values: Mapping[Path, Value]
@@ -89,8 +89,8 @@ def entries_of(device: ExistingDevice, fleet: Fleet | None, options: ImportOptio
     node: dict[str, Value] = {"groups": list(options.groups)} if options.groups else {}
     node["hardware"] = hardware
     meshes = _meshes(draft, radios, address, routed_port(device, radios, lan))
-    holding = _holding(meshes, draft, address)
-    node["address"] = str(address.ip) if holding else str(address)
+    is_in_mesh_network = _is_in_mesh_network(meshes, draft, address)
+    node["address"] = str(address.ip) if is_in_mesh_network else str(address)
     node.update(_identity(draft, name))
     node.update(_wired(draft, profile, radios, lan, backbone))
     if radios:
@@ -134,7 +134,7 @@ def _fleet_sections(draft: _Draft, name: str, radios: Iterable[ExistingRadio]) -
     draft.values[("meshctl",)] = 1
     draft.values[("fleet",)] = options.fleet or device.marker.get("fleet", "") or as_name(f"{name}-fleet")
     draft.values[("country",)] = country
-    # that of a collector may do nothing but print links, and is no operator's
+    # a collector's key may only print links, and is no operator's
     logins = tuple(key for key in device.authorized_keys if LINKS_PATH not in key)
     keys = logins or ((options.operator_key,) if options.operator_key else ())
     operators: dict[str, Value] = {"ssh_keys": list(keys)}
@@ -208,7 +208,7 @@ def _known_mesh(fleet: Fleet | None, radio: ExistingRadio) -> Mesh | None:
     return max(alike, key=lambda mesh: (str(mesh.channel) == cell[0]) + (mesh.bssid == cell[1]), default=None)
 
 
-def _holding(meshes: Mapping[str, str], draft: _Draft, address: IpInterface) -> bool:
+def _is_in_mesh_network(meshes: Mapping[str, str], draft: _Draft, address: IpInterface) -> bool:
     """Whether the prefix length of the address follows from a mesh, so that the entry needs none."""
     new = (value for path, value in draft.values.items() if path[0] == "meshes")
     networks = [str(value["network"]) for value in new if isinstance(value, Mapping)]

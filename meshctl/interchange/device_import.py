@@ -103,7 +103,7 @@ def _with_extra(entries: Entries, extra: Mapping[str, str]) -> Entries:
     return replace(entries, values={**entries.values, path: {**node, "extra_uci": dict(extra)}})
 
 
-# what an entry may leave to `defaults` and groups, and how a node has it
+# keys that an entry may leave to `defaults` and groups, with the node's value
 _INHERITED: Mapping[str, Callable[[Node], object]] = {
     "hardware": lambda node: node.hardware.name,
     "role": lambda node: node.role.value,

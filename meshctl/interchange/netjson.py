@@ -1,7 +1,7 @@
 """The planned fleet as NetJSON (draft-capoano-kaplan-netjson-00): NetworkGraph and DeviceConfiguration. Pure.
 
 The graph has every link that the inventory allows: radios of one cell, by distance where both positions are known, and
-the switch that a robot's radios share. What is up is in `meshctl topology --format netjson`.
+the switch that a robot's radios share. `meshctl topology --format netjson` has the links that are up.
 """
 
 from __future__ import annotations

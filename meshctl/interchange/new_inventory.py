@@ -27,7 +27,7 @@ def new_text(values: Mapping[Entry, Value], source: str, comments: tuple[str, ..
             assert isinstance(inner, dict)
             place = inner
         place[path[-1]] = value
-    # what a device calls itself may contain a line break
+    # a device's own name may contain a line break
     lines = [HEADER.format(source=" ".join(source.split())), *(f"# {' '.join(each.split())}\n" for each in comments)]
     order = ("meshctl", "fleet", "country", "operators", "system", "meshes", "hardware", "nodes", "robots")
     for key in sorted(tree, key=order.index):

@@ -43,12 +43,12 @@ _GETTERS: Mapping[str, Callable[[Node], str]] = {
 }
 COLUMNS = (NODE, *_GETTERS)
 _LISTS = ("groups",)
-# of Python's reader, for a cell that begins with a quotation mark and goes to the end of the file
+# an error of Python's reader, for a cell that begins with a quotation mark and extends to the end of the file
 _UNCLOSED = "unexpected end of data"
 # no two devices have the same one
 _UNIQUE = (NODE, "label", "serial", "mac")
 _DELIMITERS = ",;\t"
-# as inventories, labels, barcodes and switches write it
+# MAC addresses as inventories, labels, barcodes and switches write them
 _MAC = re.compile(r"[0-9a-f]{2}(?:[:-]?[0-9a-f]{2}){5}|[0-9a-f]{4}(?:\.[0-9a-f]{4}){2}", re.IGNORECASE)
 # a formula, the error of one, and a number of many digits as spreadsheets shorten it
 _FORMULA = re.compile(r"=.*|#(?:REF!|N/A|NAME\?|VALUE!|DIV/0!|NULL!|NUM!)")
@@ -243,7 +243,7 @@ def _errors_of(values: Mapping[str, str], place: Position) -> Iterator[Diagnosti
 
 
 def _not_as_on_the_device(value: str) -> tuple[str, str] | None:
-    """What a spreadsheet or a copy from a page made of a value, and what to do; None if it may be as it was."""
+    """How a spreadsheet or a copied page has changed a value, and the remedy; None if the value may be unchanged."""
     shown = f"'{printable(value)}'"
     if _FORMULA.fullmatch(value):
         return f"{shown}, a formula or its error", "save the sheet with values instead of formulas"

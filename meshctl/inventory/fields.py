@@ -28,7 +28,7 @@ _SWITCH_PORTS = "[0-9]{1,2}t?( [0-9]{1,2}t?)*"
 # dev_valid_name() of the kernel: below IFNAMSIZ, and none of these
 _PORT = re.compile(r"[^\s/:,]{1,15}")
 _MAC = re.compile(r"[0-9A-Fa-f]{2}(?:[:-][0-9A-Fa-f]{2}){5}")
-# of any text on one line, as rendering requires
+# characters that text on one line must not contain, as rendering requires
 _CONTROL = re.compile(r"[\x00-\x1f\x7f]")
 
 

@@ -35,7 +35,7 @@ COMPUTER = "computer"
 _RANGE = re.compile(r"\[[^\]]*(?:,|\d\d+-|-\d\d)[^\]]*\]")
 _COMMA = re.compile(r",(?![^\[]*\])")  # none inside brackets
 _MAC = re.compile(r"(?:[0-9a-f]{2}:){5}[0-9a-f]{2}", re.IGNORECASE)
-# what is printed on a device; compared regardless of case
+# attributes printed on a device; compared regardless of case
 _PRINTED = ("label", "serial", "mac")
 
 Attributes = Mapping[str, Collection[str]]

@@ -6,9 +6,9 @@ from collections.abc import Iterable, Sequence
 from difflib import SequenceMatcher, get_close_matches
 from functools import lru_cache
 
-# of difflib's ratio: above it, `chanel` resembles `channel`; below it, `absent` does not resemble `base`
+# difflib's ratio: above it, `chanel` resembles `channel`; below it, `absent` does not resemble `base`
 _MIN_SIMILARITY = 0.65
-# of more names that are equally near, none is likely to be meant
+# if more names than this are equally near, none is likely to be meant
 _MAX_NAMES = 3
 
 

@@ -81,7 +81,7 @@ def _problem(store: SecretStore) -> SecretProblem:
         except InputError as error:
             if ref.kind is SecretKind.ENV and ref.where not in store.environ:
                 return ""
-            if ref.kind is SecretKind.AGE and not _opens(store, ref):
+            if ref.kind is SecretKind.AGE and not _can_decrypt(store, ref):
                 return ""
             return str(error).removeprefix(f"secret {ref}: ")
         return ""
@@ -89,7 +89,7 @@ def _problem(store: SecretStore) -> SecretProblem:
     return problem
 
 
-def _opens(store: SecretStore, ref: SecretRef) -> bool:
+def _can_decrypt(store: SecretStore, ref: SecretRef) -> bool:
     """Whether this machine can decrypt the file."""
     try:
         store.get(replace(ref, key=""))

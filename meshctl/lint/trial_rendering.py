@@ -50,7 +50,7 @@ def kinds(fleet: Fleet) -> Iterator[Node]:
 
 
 def kind_of(node: Node) -> Hashable:
-    """What the nodes of one kind have in common."""
+    """The properties that nodes of one kind share."""
     return (
         node.hardware.name,
         node.release,

@@ -89,8 +89,8 @@ class FixedPosition:
 
 @dataclass(frozen=True, slots=True)
 class LanFilter:
-    """Which group-addressed frames a radio passes from its wired ports into the mesh: address resolution, DHCP, group
-    membership and udp_mesh, and UDP to `udp_ports`."""
+    """The group-addressed frames that a radio passes from its wired ports into the mesh: address resolution, DHCP,
+    group membership and udp_mesh, and UDP to `udp_ports`."""
 
     udp_ports: tuple[int, ...] = ()
 

@@ -1,4 +1,4 @@
-"""Thin links: radios of 1 to 100 kbit/s on robots' serial ports, for a few topics when wifi is gone."""
+"""Thin links: radios of 1 to 100 kbit/s on robots' serial ports, for a few topics where Wi-Fi does not reach."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class ThinFraming(Enum):
 
     @property
     def overhead_bytes(self) -> int:
-        """What a frame costs on the air besides its bytes: COBS and CRC; headers of the radio at most."""
+        """Overhead of a frame on the air: COBS and CRC; headers of the radio at most."""
         return 60 if self.is_xbee else 24 if self is ThinFraming.MESHTASTIC else 6
 
     @property

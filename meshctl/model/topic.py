@@ -48,7 +48,7 @@ class JpegEncoding:
 
 @dataclass(frozen=True, slots=True)
 class Reduction:
-    """What the ROS bridge sends instead of what is published: at most `rate_hz` messages a second, images as JPEG, of
+    """How the ROS bridge reduces the published messages: at most `rate_hz` messages a second, images as JPEG, of
     point clouds one point per cube of `voxel_m` (adapted up to `max_voxel_m`) with these `fields` (empty: all)."""
 
     rate_hz: float | None = None

@@ -1,4 +1,4 @@
-"""Who may use the server: host names, token, origin of changes; and the headers of every answer.
+"""Access control of the server: host names, token, origin of changes; and the headers of every answer.
 
 A page of another site may send requests to a server on this machine (DNS rebinding, forged forms), so a request names a
 host that is ours, and a change comes from our own page or from no page at all.

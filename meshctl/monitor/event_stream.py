@@ -1,6 +1,6 @@
 """Server-sent events for every open page: frames as they are appended, alarms when they change.
 
-What is sent is built once per change for all pages: `FrameStore.revision` says whether the file changed, also by
+Events are built once per change for all pages: `FrameStore.revision` says whether the file changed, also by
 another process. docs/monitor.md describes the events.
 """
 
@@ -21,7 +21,7 @@ from meshctl.monitor.store import FrameStore, Revision
 
 # Another process may append to the history or acknowledge an alarm: look again after this long.
 POLL_S = 1.0
-# A comment after this long without news tells a browser that the connection lives.
+# A comment after this long without an event tells a browser that the connection lives.
 HEARTBEAT_S = 5.0
 # A silence ends without a change in the file.
 ALARMS_EVERY_S = 5.0
@@ -32,7 +32,7 @@ MAX_STREAMS = 40
 
 
 @dataclass(frozen=True, slots=True)
-class _News:
+class _Update:
     revision: Revision
     built_s: float
     latest: Frame | None
@@ -49,7 +49,7 @@ class EventStreams:
         self._is_live = is_live
         self.meters: Callable[[], Mapping[str, Any]] = dict
         self._lock = threading.Lock()
-        self._built: _News | None = None
+        self._built: _Update | None = None
         self._open = 0
 
     @property
@@ -58,7 +58,7 @@ class EventStreams:
 
     def alarms_text(self) -> str:
         """All alarms that are kept, as JSON."""
-        return self._news().alarms
+        return self._update().alarms
 
     async def stream(self, last_s: float | None) -> AsyncIterator[str]:
         """Frames newer than `last_s`, and the alarms whenever they changed, until the server stops."""
@@ -71,22 +71,22 @@ class EventStreams:
 
     async def _texts(self, last_s: float | None) -> AsyncIterator[str]:
         yield ": meshctl monitor\n\n"
-        news = await run_in_threadpool(self._news)
+        update = await run_in_threadpool(self._update)
         sent_s = -math.inf if last_s is None else last_s
-        if news.latest is not None and sent_s > news.latest.time_s:
+        if update.latest is not None and sent_s > update.latest.time_s:
             # another history, or a clock that was set back: the browser has seen none of these frames
             sent_s = -math.inf
-        for frame in await run_in_threadpool(self._missed, sent_s, news.latest):
+        for frame in await run_in_threadpool(self._missed, sent_s, update.latest):
             yield _frame_event(frame)
             sent_s = frame.time_s
         alarms, meters, quiet_s = "", "{}", 0.0
         while not self._feed.is_closed:
             quiet_s += POLL_S
-            if news.latest is not None and news.latest.time_s > sent_s:
-                yield _frame_event(news.latest)
-                sent_s, quiet_s = news.latest.time_s, 0.0
-            if news.alarms != alarms:
-                alarms, quiet_s = news.alarms, 0.0
+            if update.latest is not None and update.latest.time_s > sent_s:
+                yield _frame_event(update.latest)
+                sent_s, quiet_s = update.latest.time_s, 0.0
+            if update.alarms != alarms:
+                alarms, quiet_s = update.alarms, 0.0
                 yield _event("alarms", alarms)
             # newer than the newest frame
             if (readings := _one_line(self.meters())) != meters:
@@ -96,7 +96,7 @@ class EventStreams:
                 yield ": alive\n\n"
                 quiet_s = 0.0
             await self._feed.wait(POLL_S)
-            news = await run_in_threadpool(self._news)
+            update = await run_in_threadpool(self._update)
 
     def _missed(self, sent_s: float, latest: Frame | None) -> tuple[Frame, ...]:
         """The frames between `sent_s`, the last one a browser has seen, and `latest`."""
@@ -108,12 +108,12 @@ class EventStreams:
             if frame.time_s < latest.time_s
         )
 
-    def _news(self) -> _News:
+    def _update(self) -> _Update:
         with self._lock:
             revision, now_s = self._store.revision(), self._clock()
             known = self._built
             if known is None or known.revision != revision or abs(now_s - known.built_s) >= ALARMS_EVERY_S:
-                self._built = known = _News(revision, now_s, self._store.latest(), self._alarms_at(now_s))
+                self._built = known = _Update(revision, now_s, self._store.latest(), self._alarms_at(now_s))
             return known
 
     def _alarms_at(self, now_s: float) -> str:

@@ -1,9 +1,8 @@
 """One frame: all that is known of the fleet at one time, as one JSON document.
 
-`frame_of` makes it of the document of `meshctl status --json`, the go/no-go checks, positions and what watching costs.
-docs/monitor.md lists the fields. An unknown value is null or absent, never 0. Names and texts come from devices: escape
-them wherever they are shown.
-"""
+`frame_of` makes it of the document of `meshctl status --json`, the go/no-go checks, positions and the cost of
+monitoring. docs/monitor.md lists the fields. An unknown value is null or absent, never 0. Names and texts come from
+devices: escape them wherever they are shown."""
 
 from __future__ import annotations
 
@@ -38,7 +37,7 @@ class FramePosition:
 
 @dataclass(frozen=True, slots=True)
 class Airtime:
-    """What watching costs: bytes per second through the radios, and the share of the channel's time they take (None if
+    """Cost of monitoring: bytes per second through the radios, and the share of the channel's time they take (None if
     no rate is known); `limit_share` bounds it. `interval_s` is the time between two frames that results."""
 
     bytes_per_s: float

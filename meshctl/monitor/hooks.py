@@ -1,7 +1,7 @@
 """Report new alarms to other programs: a webhook and a command, in a thread of their own.
 
 `AlarmHooks.notify` never blocks: alarms wait in a bounded queue, and the oldest are dropped if a hook cannot follow.
-What a device says reaches a hook as JSON and as environment variables, never as part of a command line.
+Text from a device reaches a hook as JSON and as environment variables, never as part of a command line.
 """
 
 from __future__ import annotations
@@ -174,7 +174,7 @@ def _run(command: Sequence[str], document: Mapping[str, Any], timeout_s: float) 
     try:
         process.communicate(json.dumps(document).encode(), timeout_s)
     except subprocess.TimeoutExpired:
-        # what it started, too
+        # with the processes that it started
         with suppress(ProcessLookupError, PermissionError):
             os.killpg(process.pid, signal.SIGKILL)
         process.kill()

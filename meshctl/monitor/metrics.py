@@ -247,7 +247,7 @@ def _robots(status: Document) -> Iterator[MetricFamily]:
         daemon.add((robot.get("daemon") or {}).get("answers"), robot=name)
         for entry in robot.get("peers") or ():
             for key, family in peer.items():
-                # what the link to an offline peer was like last is not what it is now
+                # the last values of an offline peer's link are not its current ones
                 if entry.get("online") or key not in _OF_ONLINE_PEERS:
                     family.add(entry.get(key), robot=name, peer=entry.get("name"))
         for entry in robot.get("queues") or ():

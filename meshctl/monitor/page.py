@@ -47,7 +47,7 @@ PART_CHARACTERS = 1 << 20
 
 @dataclass(frozen=True, slots=True)
 class PageRecording:
-    """What the page shows of a history. `values` are all but the frames, `reports` the documents of udp-mesh's
+    """The part of a history that the page shows. `values` are all but the frames, `reports` the documents of udp-mesh's
     recordings, one after the other; `frames` are read while the page is written."""
 
     values: Mapping[str, Any]
@@ -81,7 +81,7 @@ def recording_of(
     reports: Iterable[Mapping[str, Any]] = (),
     limit: int = MAX_FRAMES,
 ) -> PageRecording:
-    """What the page shows of a history: its frames evenly thinned to `limit` and to `MAX_FRAMES_BYTES`. Raises
+    """The recording of a history for the page: its frames evenly thinned to `limit` and to `MAX_FRAMES_BYTES`. Raises
     ValueError for an empty history.
     """
     span = store.span()

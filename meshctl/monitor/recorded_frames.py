@@ -21,7 +21,7 @@ def frames_of(robots: Sequence[RecordedRobot], fleet: str = "recording", limit: 
     peers = {name for robot in robots for name in robot.peer_names}
     for name in sorted(peers - set(known)):
         known[name] = RecordedRobot(name, robots[0].samples)
-    # what has places and runs no daemon
+    # things that have places but run no daemon
     beacons = frozenset(name for name, robot in known.items() if not robot.times_s and name not in peers)
     sampled_s = [time_s for robot in known.values() for time_s in robot.times_s]
     step_s = STEP_S

@@ -1,8 +1,8 @@
 """Collect a frame on a schedule: snapshot -> status -> frame -> store -> hooks and other listeners.
 
 `FrameSampler.run` works in a thread of its own until `stop`. A round that fails (locked journal, unreadable key file)
-is a `problem`, and the next one is tried at its time. What a round costs on the air is measured at the sockets; the
-interval is stretched while it costs more than `limit_share` of the channel.
+is a `problem`, and the next one is tried at its time. Its traffic is measured at the sockets; the interval
+grows while it takes more than `limit_share` of the channel.
 """
 
 from __future__ import annotations
@@ -140,7 +140,7 @@ class FrameSampler:
 
     def _failed(self, problem: str) -> None:
         if self._end.is_set():
-            # what it needs may be closed already
+            # its connections may be closed already
             return
         self.problem = problem
         self._wait_s = self.interval_s

@@ -101,7 +101,7 @@ class DeviceCharts:
             for title, _, key in _QUEUES:
                 self._note(name, title, f"priority {queue.get('priority')}", queue.get(key), 1)
         for peer in _list(robot, "peers"):
-            # what an offline peer had last is not what it has now
+            # the last values of an offline peer are not its current ones
             if peer.get("online"):
                 for title, _, key, factor in _PEERS:
                     self._note(name, title, str(peer.get("name")), peer.get(key), factor)

@@ -46,8 +46,8 @@ MAX_SILENCE_S = 366 * 86400.0
 
 @dataclass(frozen=True, slots=True)
 class PageSettings:
-    """What the page asks for once. `topic_classes` maps topic names to their classes in the inventory; `has_report`:
-    there are tables and charts of udp-mesh's recordings."""
+    """Settings that the page requests once. `topic_classes` maps topic names to their classes in the inventory;
+    `has_report`: there are tables and charts of udp-mesh's recordings."""
 
     fleet: str
     version: str

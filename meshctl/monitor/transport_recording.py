@@ -139,7 +139,7 @@ class RecordedRobot:
 
 
 class _Thinning:
-    """Which of many moments in ascending order to keep: not more than are shown of the time until then."""
+    """Chooses which of many moments, in ascending order, to keep: no more than are shown of the time until then."""
 
     def __init__(self) -> None:
         self._first_s: float | None = None

@@ -169,6 +169,6 @@ def facts_of(observation: Observation) -> dict[str, str]:
         "version": observation.release.version if observation.release else "",
         "revision": observation.release.revision if observation.release else "",
         "cell": "" if observation.links is None else "some" if mesh_macs(observation) else "none",
-        "neighbours": " ".join(neighbour.mac for neighbour in observation.neighbours or ()),
+        "neighbours": " ".join(neighbor.mac for neighbor in observation.neighbors or ()),
     }
     return {key: value for key, value in facts.items() if value}

@@ -126,7 +126,7 @@ def query_neighbors(
     """The same, from new observations of former neighbors, their bases, and some other nodes that answered before."""
     missing = tuple(names)
     graph = before.graph(fleet, known)
-    neighbors = [other for name in missing for other in graph.neighbours.get(name, ())]
+    neighbors = [other for name in missing for other in graph.neighbors.get(name, ())]
     witnesses = [
         name
         for name in dict.fromkeys((*neighbors, *fleet.bases_of(missing), *before.observations))

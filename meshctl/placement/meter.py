@@ -1,6 +1,6 @@
 """The placement meter: measured links of a robot that carries beacons -> how far it may go before it drops one. Pure.
 
-`Meter.step` takes one `Look` (all links of the robot's radio at one moment) and returns a `Reading`:
+`Meter.step` takes one `LinkSnapshot` (all links of the robot's radio at one moment) and returns a `Reading`:
 
 1. The margin of each relay in reach is the worse of its link's margin and the bottleneck of its path to the base.
 2. The slope of the next hop's signal per driven meter gives the meters that are left.
@@ -64,7 +64,7 @@ class Advice(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class LinkLook:
+class RelayLink:
     """One relay as the robot's radio hears it, and (`back_dbm`) as the relay hears the robot; None is unknown."""
 
     relay: str
@@ -85,12 +85,12 @@ class PathBeyond:
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
+class LinkSnapshot:
     """The robot's links at one moment. `paths` has every relay that reaches the base; `next_hop` is the routing
     protocol's choice, if known; `beacons` is how many the robot still carries."""
 
     now_s: float
-    links: tuple[LinkLook, ...]
+    links: tuple[RelayLink, ...]
     paths: Mapping[str, PathBeyond]
     position: Position | None = None
     next_hop: str = ""
@@ -165,17 +165,17 @@ class Meter:
     _heard_s: float | None = None
     _is_returning: bool = False
 
-    def step(self, look: Look) -> Reading:
-        """The reading after this look. Looks come in ascending order of time."""
-        self._drive(look.position)
-        self._take(look)
-        hops = {hop.relay: hop for hop in self._hops(look)}
+    def step(self, snapshot: LinkSnapshot) -> Reading:
+        """The reading after this snapshot. Snapshots come in ascending order of time."""
+        self._drive(snapshot.position)
+        self._take(snapshot)
+        hops = {hop.relay: hop for hop in self._hops(snapshot)}
         if not hops:
-            return self._without_link(look)
+            return self._without_link(snapshot)
         self._heard_s = max(self._samples[relay][-1].at_s for relay in hops)
-        self._measure_turn(look, hops)
+        self._measure_turn(snapshot, hops)
         best = max(hops.values(), key=lambda hop: (hop.path_margin_db, hop.relay))
-        hop = hops.get(look.next_hop, best)
+        hop = hops.get(snapshot.next_hop, best)
         other_db = max((other.link_margin_db for other in hops.values() if other is not hop), default=-math.inf)
         slope = slope_db_per_m(tuple(self._samples[hop.relay]), SLOPE_WINDOW_M, MIN_SLOPE_M)
         left_m = _meters_left(hop.link_margin_db, slope)
@@ -183,9 +183,9 @@ class Meter:
             self._last_good, self._good_fade_db = self._position, min(hop.fade_db, UNMEASURED_FADE_DB)
         if max(hop.link_margin_db, other_db) > VETO_DB:
             self._is_returning = False
-        advice, reason = self._judge(look, hop, other_db, left_m)
+        advice, reason = self._judge(snapshot, hop, other_db, left_m)
         return Reading(
-            look.now_s,
+            snapshot.now_s,
             advice,
             reason,
             margin_db=hop.link_margin_db,
@@ -200,8 +200,8 @@ class Meter:
             last_good=self._last_good,
             back_m=self._back_m(),
             turn_loss_db=self._turn_loss_db(),
-            beacons=look.beacons,
-            depth_left_m=_depth_left_m(left_m, look),
+            beacons=snapshot.beacons,
+            depth_left_m=_depth_left_m(left_m, snapshot),
         )
 
     def _drive(self, position: Position | None) -> None:
@@ -210,30 +210,30 @@ class Meter:
             self._driven_m += step_m if step_m <= _MAX_STEP_M else 0.0
         self._position = position if position is not None else self._position
 
-    def _take(self, look: Look) -> None:
-        for link in look.links:
+    def _take(self, snapshot: LinkSnapshot) -> None:
+        for link in snapshot.links:
             snr_db = worse_snr_db(link.signal_dbm, link.noise_dbm, link.back_dbm, link.back_noise_dbm)
             kept = self._samples.setdefault(link.relay, deque(maxlen=_KEPT_SAMPLES))
-            kept.append(Sample(look.now_s, snr_db, self._driven_m))
+            kept.append(Sample(snapshot.now_s, snr_db, self._driven_m))
         for relay, kept in list(self._samples.items()):
-            while kept and look.now_s - kept[0].at_s > _KEPT_S:
+            while kept and snapshot.now_s - kept[0].at_s > _KEPT_S:
                 kept.popleft()
             if not kept:
                 del self._samples[relay]
 
-    def _is_turning(self, look: Look) -> bool:
+    def _is_turning(self, snapshot: LinkSnapshot) -> bool:
         """Whether the heading has changed within the last meters; a turn counts once."""
-        if look.heading_rad is None:
+        if snapshot.heading_rad is None:
             return False
         while self._headings and self._driven_m - self._headings[0][0] > TURN_WINDOW_M:
             self._headings.popleft()
-        turned = any(abs(math.remainder(look.heading_rad - old, math.tau)) > TURN_RAD for _, old in self._headings)
+        turned = any(abs(math.remainder(snapshot.heading_rad - old, math.tau)) > TURN_RAD for _, old in self._headings)
         if turned:
             self._headings.clear()
-        self._headings.append((self._driven_m, look.heading_rad))
+        self._headings.append((self._driven_m, snapshot.heading_rad))
         return turned
 
-    def _measure_turn(self, look: Look, hops: Mapping[str, _Hop]) -> None:
+    def _measure_turn(self, snapshot: LinkSnapshot, hops: Mapping[str, _Hop]) -> None:
         """Learn what a bend costs from the link that the robot had in it, as soon as it is behind it."""
         turn = self._turn
         if turn is None:
@@ -251,12 +251,12 @@ class Meter:
         losses = (FIRST_TURN_LOSS_DB, *self._turn_losses_db)
         return sum(losses) / len(losses)
 
-    def _hops(self, look: Look) -> list[_Hop]:
+    def _hops(self, snapshot: LinkSnapshot) -> list[_Hop]:
         """Every relay that was heard lately and reaches the base."""
         found = []
-        for relay, beyond in look.paths.items():
+        for relay, beyond in snapshot.paths.items():
             samples = tuple(self._samples.get(relay, ()))
-            if not samples or look.now_s - samples[-1].at_s > LOST_S:
+            if not samples or snapshot.now_s - samples[-1].at_s > LOST_S:
                 continue
             snr_db, fade_db = filtered_snr_db(samples), fade_allowance_db(samples)
             link_db = snr_db - self.required_snr_db - fade_db
@@ -266,20 +266,20 @@ class Meter:
             found.append(_Hop(relay, snr_db, fade_db, link_db, whole_db, fresh_db, beyond.hops + 1, least_db))
         return found
 
-    def _without_link(self, look: Look) -> Reading:
+    def _without_link(self, snapshot: LinkSnapshot) -> Reading:
         if self._heard_s is None:
             reason = "no relay that reaches the base has been heard yet"
         else:
             self._is_returning = True
-            reason = f"no relay that reaches the base for {look.now_s - self._heard_s:.0f} s"
+            reason = f"no relay that reaches the base for {snapshot.now_s - self._heard_s:.0f} s"
         return Reading(
-            look.now_s,
+            snapshot.now_s,
             Advice.TURN_BACK,
             reason,
             last_good=self._last_good,
             back_m=self._back_m(),
             turn_loss_db=self._turn_loss_db(),
-            beacons=look.beacons,
+            beacons=snapshot.beacons,
         )
 
     def _back_m(self) -> float | None:
@@ -288,36 +288,38 @@ class Meter:
             return None
         return math.dist(self._last_good, self._position)
 
-    def _judge(self, look: Look, hop: _Hop, other_db: float, left_m: float | None) -> tuple[Advice, str]:
-        turns = self._is_turning(look)
+    def _judge(self, snapshot: LinkSnapshot, hop: _Hop, other_db: float, left_m: float | None) -> tuple[Advice, str]:
+        turns = self._is_turning(snapshot)
         if turns and not self._is_returning:
             self._turn = _Turn(hop.relay, hop.snr_db, self._driven_m)
             if max(hop.link_margin_db, other_db) < self._turn_loss_db():
-                return self._drop(look, Advice.DROP_NOW, f"a bend: bends cost about {self._turn_loss_db():.0f} dB here")
+                return self._drop(
+                    snapshot, Advice.DROP_NOW, f"a bend: bends cost about {self._turn_loss_db():.0f} dB here"
+                )
         if other_db > VETO_DB:
             return Advice.GO, f"another relay is in reach with {other_db:.0f} dB"
         # the allowance of the last 10 s still has the fall in it
         if self._is_returning and hop.fresh_db >= self._good_fade_db:
-            return self._drop(look, Advice.DROP_NOW, "back at a place with a margin")
+            return self._drop(snapshot, Advice.DROP_NOW, "back at a place with a margin")
         if hop.link_margin_db < COLLAPSE_DB and self._last_good is not None:
             self._is_returning = True
         if self._is_returning:
-            what = "no beacon left" if look.beacons == 0 else "place the beacon at the last place with one"
+            what = "no beacon left" if snapshot.beacons == 0 else "place the beacon at the last place with one"
             return Advice.TURN_BACK, f"no margin: {what}"
         if hop.link_margin_db < 0.0:
-            return self._drop(look, Advice.DROP_NOW, "no margin left")
+            return self._drop(snapshot, Advice.DROP_NOW, "no margin left")
         if hop.link_margin_db > STEEP_DB:
             left_m = None
         if left_m is not None and left_m < NOW_M:
-            return self._drop(look, Advice.DROP_NOW, f"{left_m:.0f} m left")
+            return self._drop(snapshot, Advice.DROP_NOW, f"{left_m:.0f} m left")
         if left_m is not None and left_m < SOON_M:
-            return self._drop(look, Advice.DROP_SOON, f"{left_m:.0f} m left")
+            return self._drop(snapshot, Advice.DROP_SOON, f"{left_m:.0f} m left")
         if hop.path_margin_db < 0.0:
             return Advice.GO, f"a hop behind {hop.relay} has {hop.path_margin_db:.0f} dB: a beacon is missing there"
         return Advice.GO, ""
 
-    def _drop(self, look: Look, advice: Advice, reason: str) -> tuple[Advice, str]:
-        if look.beacons == 0:
+    def _drop(self, snapshot: LinkSnapshot, advice: Advice, reason: str) -> tuple[Advice, str]:
+        if snapshot.beacons == 0:
             return Advice.TURN_BACK if advice is Advice.DROP_NOW else advice, f"{reason}, and no beacon left"
         return advice, reason
 
@@ -329,7 +331,7 @@ def _meters_left(margin_db: float, slope: float | None) -> float | None:
     return max(0.0, margin_db) / -slope
 
 
-def _depth_left_m(left_m: float | None, look: Look) -> float | None:
-    if look.beacons is None or look.spacing_m is None:
+def _depth_left_m(left_m: float | None, snapshot: LinkSnapshot) -> float | None:
+    if snapshot.beacons is None or snapshot.spacing_m is None:
         return None
-    return (left_m or 0.0) + look.beacons * look.spacing_m
+    return (left_m or 0.0) + snapshot.beacons * snapshot.spacing_m

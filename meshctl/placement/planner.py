@@ -38,7 +38,7 @@ class Walls:
 
 
 @dataclass(frozen=True, slots=True)
-class Rock:
+class MappedTerrain:
     """A terrain of an occupancy map; what is not free costs as `wall` each time that the line enters it."""
 
     occupancy: OccupancyMap

@@ -45,8 +45,8 @@ def fleet_plan(
     in_order = stages_of(todo, surroundings, found.nodes)
     at_once = stages_together(todo, surroundings, found.nodes)
     stages = at_once if together else in_order
-    cuts = graph.cut_off_by_any(entries)
-    refusal, hint = _refusal(found, plans, cuts, frozenset(accept_cuts))
+    cut_off_by = graph.cut_off_by_any(entries)
+    refusal, hint = _refusal(found, plans, cut_off_by, frozenset(accept_cuts))
     if together and not refusal:
         refusal, hint = _refused_together(at_once, plans)
     windows = [fleet.nodes[plan.node].confirm_window_s for plan in todo]
@@ -64,11 +64,11 @@ def fleet_plan(
         and not any(name in nodes for nodes in found.nodes.values())
     ]
     notes += [
-        f"stage {number}: {name} is a cut vertex: {', '.join(cuts[name])} {_cut_off_for(plans[name])}"
+        f"stage {number}: {name} is a cut vertex: {', '.join(cut_off_by[name])} {_cut_off_for(plans[name])}"
         for number, stage in enumerate(stages, 1)
         if stage.cuts_off and stage.kind is not StageKind.LAST
         for name in stage.nodes
-        if name in cuts
+        if name in cut_off_by
     ]
     return Plan(
         fleet.name,
@@ -119,7 +119,7 @@ def _folded(refused: Mapping[str, str]) -> str:
 def _refusal(
     found: MeshSwitches,
     plans: Mapping[str, NodePlan],
-    cuts: Mapping[str, tuple[str, ...]],
+    cut_off_by: Mapping[str, tuple[str, ...]],
     accepted: frozenset[str],
 ) -> tuple[str, str]:
     for mesh, why in found.blocked.items():
@@ -139,9 +139,9 @@ def _refusal(
             f"switch them on and select them too, or acknowledge with --leave-behind {how}",
         )
     for name, plan in plans.items():
-        if plan.firmware is not None and plan.is_meshed and cuts.get(name) and not accepted & {name, "all"}:
+        if plan.firmware is not None and plan.is_meshed and cut_off_by.get(name) and not accepted & {name, "all"}:
             return (
-                f"flashing {name} cuts off {', '.join(cuts[name])}, permanently if it does not come back",
+                f"flashing {name} cuts off {', '.join(cut_off_by[name])}, permanently if it does not come back",
                 f"give them another path first, or acknowledge with --accept-cut {name}",
             )
     return "", ""

@@ -1,4 +1,4 @@
-"""Which services a configuration change reloads, and what that interrupts.
+"""The services that a configuration change reloads, and what they interrupt.
 
 `reload_config` reloads the service of each changed package (procd's triggers). What that interrupts depends on the
 changed options and the release, since netifd takes down only what differs.

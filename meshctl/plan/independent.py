@@ -1,4 +1,4 @@
-"""Which meshes of a fleet do not depend on each other, so that they can be changed at the same time. Pure.
+"""Group the meshes of a fleet that do not depend on each other and can change at the same time. Pure.
 
 Meshes depend on each other if a node other than an entry is in both, if nodes of both hear or are wired to each other,
 or if a node of one is the jump host to nodes of the other.

@@ -14,9 +14,9 @@ from meshctl.plan.cell import enabled_interfaces
 from meshctl.plan.observed_files import WIRELESS, packages_seen
 from meshctl.uci import Package
 
-# as the interfaces of meshes are named (`Node.mesh_interfaces`); others are not ours
+# names of mesh interfaces (`Node.mesh_interfaces`); other interfaces are not ours
 _OURS = re.compile(r"mesh[0-9]+")
-# as iw writes them
+# modes as iw writes them
 _MESH_MODES = ("IBSS", "mesh point")
 
 

@@ -13,7 +13,7 @@ from meshctl.device.observation import FileInfo, Observation
 from meshctl.diagnostics import InvalidInput
 from meshctl.model.ip import IpAddress
 from meshctl.plan.cell import Cell
-from meshctl.topology import NEIGHBOUR_FRESH_MS
+from meshctl.topology import NEIGHBOR_FRESH_MS
 from meshctl.uci import Package, Section, parse
 
 CONFIG = "etc/config/"
@@ -109,6 +109,6 @@ def is_meshed(observation: Observation, live: Mapping[str, Cell]) -> bool:
     """Whether the node is part of a running mesh: a radio in a cell, and a neighbor heard recently or unknown."""
     if not live:
         return False
-    if observation.neighbours is not None:
-        return any(neighbour.last_seen_ms <= NEIGHBOUR_FRESH_MS for neighbour in observation.neighbours)
+    if observation.neighbors is not None:
+        return any(neighbor.last_seen_ms <= NEIGHBOR_FRESH_MS for neighbor in observation.neighbors)
     return observation.stations is None or bool(observation.stations)

@@ -109,25 +109,25 @@ def _rolling(plans: Sequence[NodePlan], context: MeshContext) -> tuple[Stage, ..
     """From the far end inward, in each independent mesh at most `max_down` at once and each cut vertex alone, the
     entries last."""
     paths = context.graph.paths_to_any(context.entries)
-    cuts = context.graph.cut_off_by_any(context.entries)
+    cut_off_by = context.graph.cut_off_by_any(context.entries)
     waiting = [plan.node for plan in plans if plan.node not in context.entries]
     stays_up = {plan.node for plan in plans if plan.cut <= Cut.WEAK_LINKS}
     stages: list[Stage] = []
     if context.policy.canary and len(waiting) > 1:
         # the farthest node that is not a cut vertex
-        canary = next((name for name in waiting if name not in cuts), waiting[0])
+        canary = next((name for name in waiting if name not in cut_off_by), waiting[0])
         waiting.remove(canary)
         reason = f"canary: first alone; {_distance(canary, paths)}"
-        stages.append(Stage(StageKind.CANARY, (canary,), reason, cuts.get(canary, ())))
+        stages.append(Stage(StageKind.CANARY, (canary,), reason, cut_off_by.get(canary, ())))
     parts = by_group(waiting, context.groups_of)
     while parts := [part for part in parts if part]:
         batches: list[tuple[str, ...]] = []
         for part in parts:
-            batch = _batch(part, context, cuts)
+            batch = _batch(part, context, cut_off_by)
             if not _robots(batch, context) & _robots((name for taken in batches for name in taken), context):
                 batches.append(batch)
                 part[:] = [name for name in part if name not in batch]
-        stages.append(_step(batches, cuts, paths, stays_up))
+        stages.append(_step(batches, cut_off_by, paths, stays_up))
     changing = {plan.node for plan in plans}
     stages += _entry_stages([entry for entry in context.entries if entry in changing], context)
     return tuple(stages)
@@ -135,19 +135,21 @@ def _rolling(plans: Sequence[NodePlan], context: MeshContext) -> tuple[Stage, ..
 
 def _step(
     batches: Sequence[tuple[str, ...]],
-    cuts: Mapping[str, tuple[str, ...]],
+    cut_off_by: Mapping[str, tuple[str, ...]],
     paths: Mapping[str, Path],
     stays_up: Container[str],
 ) -> Stage:
     """One stage of these batches, each of another independent mesh."""
-    reasons = [_batch_reason(batch, cuts.get(batch[0], ()), paths, batch[0] in stays_up) for batch in batches]
+    reasons = [_batch_reason(batch, cut_off_by.get(batch[0], ()), paths, batch[0] in stays_up) for batch in batches]
     reason = reasons[0]
     if len(reasons) > _MAX_REASONS:
         reason = f"{len(batches)} independent meshes at the same time, each starting at its far end"
     elif len(reasons) > 1:
         reason = f"independent meshes at the same time: {'; '.join(reasons)}"
     nodes = tuple(name for batch in batches for name in batch)
-    return Stage(StageKind.ROLLING, nodes, reason, tuple(lost for batch in batches for lost in cuts.get(batch[0], ())))
+    return Stage(
+        StageKind.ROLLING, nodes, reason, tuple(lost for batch in batches for lost in cut_off_by.get(batch[0], ()))
+    )
 
 
 def _batch_reason(batch: Sequence[str], lost: Sequence[str], paths: Mapping[str, Path], stays_up: bool) -> str:
@@ -182,14 +184,14 @@ def _robots(names: Iterable[str], context: MeshContext) -> set[str]:
     return {context.robot_of.get(name, "") for name in names} - {""}
 
 
-def _batch(waiting: Sequence[str], context: MeshContext, cuts: Mapping[str, tuple[str, ...]]) -> tuple[str, ...]:
+def _batch(waiting: Sequence[str], context: MeshContext, cut_off_by: Mapping[str, tuple[str, ...]]) -> tuple[str, ...]:
     batch = [waiting[0]]
-    if waiting[0] in cuts:
+    if waiting[0] in cut_off_by:
         return (waiting[0],)
     for name in waiting[1:]:
         if len(batch) >= max(1, context.policy.max_down):
             break
-        if name in cuts or _robots((name,), context) & _robots(batch, context):
+        if name in cut_off_by or _robots((name,), context) & _robots(batch, context):
             continue
         if not context.graph.cut_off_by_all(context.entries, [*batch, name]):
             batch.append(name)

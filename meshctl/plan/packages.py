@@ -1,4 +1,4 @@
-"""Which packages a node lacks, and which package files provide them (nodes have no internet)."""
+"""The packages that a node lacks, and the package files that provide them (nodes have no internet)."""
 
 from __future__ import annotations
 

@@ -99,7 +99,7 @@ def radio_changes(before: Package, after: Package, release: Release) -> tuple[Ra
         restarts = release < Release.V23_05 or bool(faces) or not device <= in_place
         loses = bool(device & RANGE) and not _is_stronger(device, old_parts[0], new_parts[0])
         options = (*sorted(device | faces), *((ORDER,) if moved_device or moved_faces else ()))
-        # of an interface without a mode nothing is known
+        # nothing is known of an interface without a mode
         has_links = any(face.get("mode") != "ap" for face in (*old_parts[1:], *new_parts[1:]))
         changes.append(
             RadioChange(name, options, restarts, not restarts and loses, not restarts and moved_faces, has_links)

@@ -73,11 +73,12 @@ def ways_of(
         _rolling_risk(in_order, plans),
     )
     count = len(simultaneous.nodes)
-    cuts = [plans[name].cut > Cut.LOGIN for name in simultaneous.nodes]
-    lost = (
-        "all of them are interrupted at the same moment, once" if all(cuts) else
-        f"{sum(cuts)} of them are interrupted at the same moment, once" if any(cuts) else "interrupts nothing"
-    )  # fmt: skip
+    interrupted = [plans[name].cut > Cut.LOGIN for name in simultaneous.nodes]
+    if any(interrupted):
+        affected = "all" if all(interrupted) else str(sum(interrupted))
+        lost = f"{affected} of them are interrupted at the same moment, once"
+    else:
+        lost = "interrupts nothing"
     at_once = Way(
         TOGETHER,
         len(together),
@@ -139,7 +140,7 @@ def _recommended(rolling: Way, at_once: Way) -> tuple[Way, Way]:
         return rolling, replace(at_once, reason=reason)
     if saved_s > LONG_S:
         return rolling, replace(at_once, reason=f"it takes {saved_s / 60:.0f} minutes less")
-    return replace(rolling, reason="a fault shows on few nodes, and the others go on working"), at_once
+    return replace(rolling, reason="a fault shows on few nodes, and the others keep working"), at_once
 
 
 def _times(count: int) -> str:

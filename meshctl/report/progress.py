@@ -62,27 +62,33 @@ def _write_error(text: str) -> None:
         sys.stderr.flush()
 
 
-class PlainProgress(RunProgress):
-    """One line per step and outcome, for logs and pipes."""
-
-    def stopping(self, text: str) -> None:
-        _write_error(text)
+class _LineProgress(RunProgress):
+    """Lines written to a stream, for logs, pipes and scripts; stop messages go to standard error."""
 
     def __init__(self, out: TextIO) -> None:
         self._out = out
         self._lock = threading.Lock()
 
-    def __call__(self, event: Event) -> None:
-        text = _line(event)
-        if text:
-            with self._lock:
-                self._out.write(f"{text}\n")
-                self._out.flush()
+    def stopping(self, text: str) -> None:
+        _write_error(text)
+
+    def _write(self, line: str) -> None:
+        with self._lock:
+            self._out.write(f"{line}\n")
+            self._out.flush()
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         return
+
+
+class PlainProgress(_LineProgress):
+    """One line per step and outcome."""
+
+    def __call__(self, event: Event) -> None:
+        if text := _line(event):
+            self._write(text)
 
 
 def _line(event: Event) -> str:
@@ -105,15 +111,8 @@ def _raw_line(event: Event) -> str:
             return outcome_text(event.outcome) + hint
 
 
-class JsonProgress(RunProgress):
+class JsonProgress(_LineProgress):
     """One JSON object per event: `{"event", "node", "at_s", ...}`."""
-
-    def stopping(self, text: str) -> None:
-        _write_error(text)
-
-    def __init__(self, out: TextIO) -> None:
-        self._out = out
-        self._lock = threading.Lock()
 
     def __call__(self, event: Event) -> None:
         line: dict[str, object] = {"event": event.kind.value, "node": event.node, "at_s": round(event.at_s, 3)}
@@ -123,14 +122,7 @@ class JsonProgress(RunProgress):
             line["fraction"] = round(event.fraction, 3)
         if event.outcome is not None:
             line["outcome"] = outcome_object(event.outcome)
-        with self._lock:
-            self._out.write(json_safe(json.dumps(line, ensure_ascii=False)) + "\n")
-            self._out.flush()
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        return
+        self._write(json_safe(json.dumps(line, ensure_ascii=False)))
 
 
 def outcome_object(outcome: Outcome) -> dict[str, object]:

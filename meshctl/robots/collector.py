@@ -43,8 +43,8 @@ class ConfigurationError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Configuration:
-    """What meshctl renders for one robot. `macs` are those of the inventory; `names` is the file of those that were
-    observed: MAC -> node."""
+    """The configuration that meshctl renders for one robot. `macs` are those of the inventory; `names` is the file of
+    those that were observed: MAC -> node."""
 
     robot: str
     radios: tuple[OwnRadio, ...]
@@ -258,7 +258,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """The service. Its log goes to standard error, and from there to the journal."""
     parser = argparse.ArgumentParser(
         prog="python3 -m meshctl.robots.collector",
-        description="Tell the udp_mesh daemon what the robot's radios measure.",
+        description="Report the measurements of the robot's radios to the udp_mesh daemon.",
     )
     parser.add_argument("configuration", type=Path, help="collector.json, as meshctl renders it")
     parser.add_argument("--socket", type=Path, help="the daemon's socket; default: UDP_MESH_SOCKET")

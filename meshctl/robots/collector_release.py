@@ -53,7 +53,7 @@ MODULES = (
 
 @dataclass(frozen=True, slots=True)
 class RadioKnowledge:
-    """What is known of the radios besides the inventory: `pinned` gives the trusted host keys of a node, `names` the
+    """Facts about the radios that are not in the inventory: `pinned` gives the trusted host keys of a node, `names` the
     node of each MAC that was observed."""
 
     pinned: Callable[[str], tuple[HostKey, ...]] = lambda node: ()

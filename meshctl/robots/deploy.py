@@ -134,8 +134,8 @@ def plan_deploy(host: Host, robot: str, options: DeployOptions) -> tuple[HostFac
 
 def _unmet_for_port(host: Host, robot: str, options: DeployOptions, old: int) -> list[tuple[str, str]]:
     """A daemon on a new port does not hear peers that are still on the old one, and would be rolled back for that."""
-    seen = collect_facts(host, robot, expected_release(options.fleet, robot, options.secrets), now_s=options.now_s())
-    if not (left := sorted(options.apart & set(seen.online))):
+    facts = collect_facts(host, robot, expected_release(options.fleet, robot, options.secrets), now_s=options.now_s())
+    if not (left := sorted(options.apart & set(facts.online))):
         return []
     count = sum(other.computer is not None for other in options.fleet.robots.values())
     port = options.fleet.udp_mesh.port
@@ -164,7 +164,7 @@ def deploy(host: Host, robot: str, options: DeployOptions) -> Outcome:
             key = _prepare_collector(host, robot, options)
         same = Outcome(robot, Result.UNCHANGED, f"already runs {release.id}", facts={"release": release.id, **key})
         return _with_warnings(same, facts, options)
-    if options.only_configuration and not _only_configuration(facts, release):
+    if options.only_configuration and not _needs_only_reload(facts, release):
         return _refused(robot, [_more_than_configuration(facts, release)])
     is_new = release.id not in facts.releases or bool(facts.damaged)
     needed = release.unpacked_bytes if is_new and (release.tree not in facts.trees or facts.damaged) else 0
@@ -174,7 +174,7 @@ def deploy(host: Host, robot: str, options: DeployOptions) -> Outcome:
     with claim(host, current=facts.current):
         sent = _transfer(host, robot, options, release, is_new=is_new, with_wheels=needed > 0)
         key = _prepare_collector(host, robot, options)
-        how = "reload" if _only_configuration(facts, release) else "restart"
+        how = "reload" if _needs_only_reload(facts, release) else "restart"
         with options.step(robot, "switch", f"to {release.id} ({how})"):
             outcome = switch(host, robot, release.id, how, options.wait_s)
     details = {**outcome.facts, "release": release.id, "how": how, "sent_bytes": str(sent), **key}
@@ -198,7 +198,7 @@ def _transfer(
 
 
 def _prepare_collector(host: Host, robot: str, options: DeployOptions) -> dict[str, str]:
-    """What is known of the radios by now goes to the robot's collector. Returns its public key as a fact, if it has
+    """Give the robot's collector the current facts about the radios. Returns its public key as a fact, if it has
     one."""
     if not has_collector(options.fleet, robot):
         return {}
@@ -214,7 +214,7 @@ def _with_warnings(outcome: Outcome, facts: HostFacts, options: DeployOptions) -
     return outcome
 
 
-def _only_configuration(facts: HostFacts, release: Bundle) -> bool:
+def _needs_only_reload(facts: HostFacts, release: Bundle) -> bool:
     """Whether a reload of the running daemon suffices, which keeps all messages."""
     return facts.is_sound and not _other_files(facts, release)
 

@@ -156,7 +156,7 @@ class RobotFacts:
 
     @property
     def reached_through(self) -> tuple[str, ...]:
-        """Whom it reaches through whom, one text per online peer behind relays: `uav1 through husky1`."""
+        """The peers reached through relays, one text each: `uav1 through husky1`."""
         relayed = (peer for peer in self.peers if peer.online and peer.via)
         return tuple(f"{peer.name} through {' and '.join(peer.via)}" for peer in relayed)
 

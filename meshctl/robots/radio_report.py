@@ -89,7 +89,7 @@ class RadioTracker:
         }
 
     def _best(self, nodes: tuple[str, ...], names: Names, tables: Mapping[str, LinkTable]) -> _Path | None:
-        """Of all radios, the path with the best measure; whichever the bridge between them really uses."""
+        """The path with the best measure of all radios, regardless of the one that the bridge between them uses."""
         found = [path for radio, table in tables.items() for path in _paths(radio, table, nodes, names.nodes)]
         return max(found, key=lambda path: path.rank, default=None)
 

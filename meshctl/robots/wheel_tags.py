@@ -57,12 +57,12 @@ def parse_wheel(file: str) -> WheelName | None:
 
 def is_compatible(target: Target, wheel: WheelName) -> bool:
     """Whether pip on that computer would accept the wheel."""
-    return any(_python(target, python, abi) for python in wheel.pythons for abi in wheel.abis) and any(
-        _platform(target, platform) for platform in wheel.platforms
+    return any(_python_matches(target, python, abi) for python in wheel.pythons for abi in wheel.abis) and any(
+        _platform_matches(target, platform) for platform in wheel.platforms
     )
 
 
-def _python(target: Target, python: str, abi: str) -> bool:
+def _python_matches(target: Target, python: str, abi: str) -> bool:
     major, minor = target.python
     found = re.fullmatch(r"(?P<kind>py|cp)(?P<major>\d)(?P<minor>\d*)", python)
     if found is None or int(found["major"]) != major:
@@ -78,7 +78,7 @@ def _python(target: Target, python: str, abi: str) -> bool:
             return abi == python == f"cp{major}{minor}"
 
 
-def _platform(target: Target, platform: str) -> bool:
+def _platform_matches(target: Target, platform: str) -> bool:
     if platform == "any":
         return True
     if platform == f"linux_{target.arch}":

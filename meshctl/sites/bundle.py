@@ -48,7 +48,7 @@ class SiteBundle:
 
 
 class PartDiffers(MeshctlError):
-    """The part of a site would be read otherwise than the inventory: a defect of meshctl, found before any change."""
+    """The part of a site would be read differently from the inventory: a bug in meshctl, found before any change."""
 
 
 def site_bundle(
@@ -101,7 +101,7 @@ def _check(part: SitePart, fleet: Fleet, site: str) -> None:
     if found:
         raise PartDiffers(
             f"site {site}: the part of the inventory for its worker would differ: {', '.join(found[:8])}",
-            hint="this is a defect of meshctl: nothing was sent; provision these nodes without the worker",
+            hint="this is a bug in meshctl; nothing was sent: provision these nodes without the worker",
         )
 
 

@@ -1,8 +1,8 @@
-"""Envelopes for a carrier that is not trusted: what is in a message only its receiver reads, and only its sender wrote.
+"""Envelopes for an untrusted carrier: only the receiver can read a message, and only the sender can have written it.
 
 A request is signed by an operator's SSH key and sealed (age) for the worker's, which is in the inventory. A reply is
 signed by the worker's key and sealed for a key that the operator made for this request. Events of a run have no
-secrets: they are signed and not sealed, so that every operator can read them. What is sealed is compressed before.
+secrets: they are signed and not sealed, so that every operator can read them. Sealed messages are compressed first.
 """
 
 from __future__ import annotations
@@ -105,7 +105,7 @@ def opened_by_worker(data: bytes, private_key: bytes) -> bytes:
 
 
 def inflated(data: bytes) -> bytes:
-    """What was compressed, if it is no larger than a message may be: nothing proves yet who sent it. Raises
+    """The decompressed data, if it is no larger than a message may be: nothing proves yet who sent it. Raises
     EnvelopeRefused."""
     stream = zlib.decompressobj()
     try:

@@ -38,7 +38,7 @@ _EXTENSIONS = "meshctl.extensions"
 _PIP_TIMEOUT_S = 600
 _INSTALL_TIMEOUT_S = 600.0
 _KEPT_RELEASES = 3
-# of gzip: the highest takes four times as long for one percent
+# gzip level: the highest takes four times as long for one percent
 _LEVEL = 6
 _DIGITS = 16
 
@@ -185,8 +185,8 @@ def _tree(folder: Path, name: str) -> Iterator[TarMember]:
 
 
 def requirements(extra: str = "") -> tuple[str, ...]:
-    """What meshctl itself requires, as in its package's metadata, and what one of its extras does, without extras of
-    that: they are for operators."""
+    """The requirements of meshctl in its package's metadata, and those of one of its extras; other extras are for
+    operators."""
     found: list[str] = []
     for line in distribution(_DISTRIBUTION).requires or ():
         requirement, _, marker = line.partition(";")

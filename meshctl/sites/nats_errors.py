@@ -10,9 +10,7 @@ HINT = "check the address, the credentials and the network; `nats.url` in the in
 # Codes of JetStream errors that room on the server's disk, or in its limits, cures: its limits are reached (in memory,
 # on disk, of its account), and a message could not be stored.
 _NO_ROOM = (10002, 10023, 10028, 10047, 10077)
-_ROOM_HINT = (
-    "make room on the disk of the NATS server, or raise its `max_file_store`; it sets 100 MB aside for each site"
-)
+_ROOM_HINT = "make room on the disk of the NATS server, or raise its `max_file_store`; it reserves 100 MB for each site"
 
 
 class NatsLost(Unreachable):
@@ -31,7 +29,7 @@ def translated(error: BaseException, url: str) -> Unreachable | None:
 
     match error:
         case NoRespondersError():
-            return NatsLost(f"NATS server {url}: no one listens")
+            return NatsLost(f"NATS server {url}: no responders")
         case APIError() if error.err_code in _NO_ROOM:
             return NatsLost(f"NATS server {url} has no room: {error.description}", hint=_ROOM_HINT)
         case APIError():

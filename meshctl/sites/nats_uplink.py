@@ -105,7 +105,7 @@ class NatsUplink(Uplink):
         found = sign(self._credentials, self.accepted_keys, data)
         if found is None:
             raise InputError(
-                f"site {self.site.name}: none of the keys in operators.ssh_keys is here to sign a request",
+                f"site {self.site.name}: no private key of operators.ssh_keys is available to sign a request",
                 hint="pass --key, or start the SSH agent",
             )
         own, signature = found

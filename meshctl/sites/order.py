@@ -57,7 +57,7 @@ class Order:
     plan_sha256: str
     part_sha256: str
     rate_kb_s: float | None = None
-    # of an order that may wait for its site, by the operator's clock (Unix time)
+    # set for an order that may wait for its site, by the operator's clock (Unix time)
     signed_s: float = 0.0
     expires_s: float | None = None
     # the hash of the firmware images' paths and hashes, and who may read what the run replaces
@@ -74,7 +74,7 @@ class Order:
                 hint="plan and order it again",
             )
         if now_s < self.signed_s - MAX_CLOCK_DIFFERENCE_S:
-            raise ClockBehind(f"the clock here says {_moment(now_s)}, and the order is of {_moment(self.signed_s)}")
+            raise ClockBehind(f"the clock here says {_moment(now_s)}, the order was signed at {_moment(self.signed_s)}")
 
 
 @dataclass(frozen=True, slots=True)

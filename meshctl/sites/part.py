@@ -212,7 +212,7 @@ def _text(text: str) -> yaml.Node:
 
 
 def differences(fleet: Fleet, part: Fleet, site: str) -> Iterator[str]:
-    """What the worker would read otherwise than the operator: `b03: address`. None, unless meshctl has a defect."""
+    """Values that the worker would read differently from the operator: `b03: address`. Any is a bug in meshctl."""
     for name, node in fleet.nodes.items():
         if node.site != site:
             continue

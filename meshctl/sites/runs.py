@@ -35,7 +35,7 @@ from typing import Any
 
 from meshctl.device.authentication import new_key_pair
 from meshctl.errors import InputError, MeshctlError
-from meshctl.fleet.process import process_lives
+from meshctl.fleet.process import is_process_alive
 from meshctl.sites.events import condensed
 from meshctl.sites.part import REPLACED_FILE
 
@@ -295,7 +295,9 @@ class RunDirectory:
 
     def is_alive(self) -> bool:
         """Whether one of the run's processes lives: the one that waits for its end, or the one that changes nodes."""
-        return any(process_lives(line) for path in (self.process, self.processes) for line in _text(path).splitlines())
+        return any(
+            is_process_alive(line) for path in (self.process, self.processes) for line in _text(path).splitlines()
+        )
 
     def taken_replaced(self) -> dict[str, Any]:
         """Node -> what the plan would replace on it, for the operator alone: it has the node's keys."""

@@ -38,7 +38,7 @@ RestartSec=5
 # a run continues while the worker is restarted or updated, or runs out of memory
 KillMode=process
 OOMPolicy=continue
-# what a login user's systemd can take away without root
+# restrictions that a login user's systemd can apply without root
 UMask=0077
 NoNewPrivileges=yes
 RestrictAddressFamilies=AF_UNIX AF_INET AF_INET6 AF_NETLINK

@@ -43,8 +43,8 @@ class Greeting:
 
 @dataclass(frozen=True, slots=True)
 class Parcel:
-    """What a site needs to execute an order: the order, and what it names by its hashes. A worker that has planned the
-    run has the rest already."""
+    """Everything a site needs to execute an order: the order, and the data that it names by hash. A worker that has
+    planned the run has the rest already."""
 
     order: SignedOrder
     run: str

@@ -270,7 +270,7 @@ def _failure(done: subprocess.CompletedProcess[bytes]) -> WorkerError:
     said = done.stderr.decode("utf-8", "replace").strip().splitlines()
     errors = [line.removeprefix("error: ") for line in said if not line.startswith("hint: ")][:_MAX_ERROR_LINES]
     hints = [line.removeprefix("hint: ") for line in said if line.startswith("hint: ")]
-    text = "\n".join(errors) or f"the command ended with {done.returncode} and said nothing"
+    text = "\n".join(errors) or f"the command exited with {done.returncode} and printed nothing"
     return WorkerError(text, hint=hints[-1] if hints else "")
 
 

@@ -20,7 +20,7 @@ from meshctl.status.radio_facts import neighbors_of, radios_of, snr_of, temperat
 from meshctl.status.robots import RobotAnswers, robot_status
 from meshctl.status.unreachable import NOT_ASKED, lost_relay_alarm, no_answer_alarm
 from meshctl.status.values import Alarm, FleetStatus, Health, Level, NoAnswer, NodeStatus, health_of
-from meshctl.topology import Graph, Report, Sighting, neighbours_of, seen_by
+from meshctl.topology import Graph, Report, Sighting, heard_by_name, seen_by
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,9 +73,9 @@ def assess(snapshot: Snapshot, nodes: Iterable[Node], now: float, robots: Iterab
     reports = snapshot.reports
     sightings = seen_by(reports.values(), snapshot.macs)
     paths = {} if snapshot.is_partial else snapshot.graph.paths_to_any(snapshot.entries)
-    cuts = {} if snapshot.is_partial else snapshot.graph.cut_off_by_any(snapshot.entries)
+    cut_off_by = {} if snapshot.is_partial else snapshot.graph.cut_off_by_any(snapshot.entries)
     entry_by_site = snapshot.entry_by_site
-    heard = {name: neighbours_of(report, snapshot.macs) for name, report in reports.items()}
+    heard = {name: heard_by_name(report, snapshot.macs) for name, report in reports.items()}
     snr = {name: snr_of(snapshot.observations[name], heard[name]) for name in reports}
     relays: dict[str, list[str]] = {}
     for name, path in paths.items():
@@ -102,7 +102,7 @@ def assess(snapshot: Snapshot, nodes: Iterable[Node], now: float, robots: Iterab
             radios=radios_of(node, observation, snapshot.previous.get(node.name)),
             path=paths.get(node.name),
             is_path_known=entry_by_site.get(node.site, snapshot.entry) in paths,
-            cuts_off=cuts.get(node.name, ()),
+            cuts_off=cut_off_by.get(node.name, ()),
             relays=tuple(name for name in relays.get(node.name, ()) if name != node.name),
             seconds_since_last_known=None if last is None else max(0.0, observation.answered_at_s - last.seen_s),
             own_lock=snapshot.own_lock,

@@ -164,7 +164,7 @@ class Collector:
     def _note(self, observations: Mapping[str, Observation]) -> None:
         for name, observation in observations.items():
             last = self._observed.get(name)
-            # what a site's worker said may stand for a while
+            # a site worker's answer may be reused for a while
             if last is not observation:
                 self._observed[name] = observation
                 if last is not None:

@@ -1,4 +1,4 @@
-"""Which beacons that the inventory has as carried have been dropped, judged from one snapshot of the mesh. Pure.
+"""Find beacons that have been dropped although the inventory has them as carried, from one snapshot. Pure.
 
 A beacon in a robot's rack is off, or within a meter of the robot's own radios. One that answers has been dropped if
 others reach the base through it, or if its robot's radios hear it weakly or not at all while another node hears it.

@@ -21,7 +21,7 @@ SEND_TIMEOUT_S = 60.0
 
 @dataclass(frozen=True, slots=True)
 class StopPlan:
-    """Which topic, from which robot, to which ones; `silent` are destinations whose daemons do not answer."""
+    """The topic of a stop, its source and its destinations; `silent` are destinations whose daemons do not answer."""
 
     topic: Topic
     source: str
@@ -40,10 +40,9 @@ class StopResult:
 def stop_plan(fleet: Fleet, answering: Iterable[str], silent: Iterable[str] = ()) -> StopPlan | None:
     """The first emergency stop of the inventory, from its first source, to its destinations among the active robots.
 
-    Of these, the daemons of `answering` answer, and those of `silent` do not: it is not sent to them, so that no robot
-    stops when its daemon starts later. Where every robot may send it, the base does. None if the inventory has no such
-    topic, or no robot that sends it.
-    """
+    It is not sent to destinations in `silent`, whose daemons do not answer, so that no robot stops when its daemon
+    starts later; those in `answering` get it. If every robot may send it, the base does. None if the inventory has no
+    such topic, or no robot that sends it."""
     names = tuple(answering)
     topic = next((each for each in fleet.topics if each.topic_class is TopicClass.EMERGENCY_STOP), None)
     base = (robot.name for robot in fleet.robots.values() if robot.is_base)

@@ -109,7 +109,7 @@ def _check(name: str, bad: Iterable[str], good: str, answers: _Answers | None = 
 
 
 def _answered(devices: Sequence[NodeStatus | RobotStatus], none: str) -> _Answers:
-    """Of the devices that are on or should be."""
+    """Answers of the devices that are on or should be."""
     expected = [device for device in devices if device.health is not Health.OFF]
     return _Answers(sum(not device.no_answer_reason for device in expected), len(expected), none)
 
@@ -123,7 +123,7 @@ def _answered_computers(status: FleetStatus) -> _Answers:
 
 
 def _installed(status: FleetStatus) -> _Answers:
-    """Of the computers of active robots, those that answer and have udp_mesh."""
+    """The computers of active robots that answer and have udp_mesh."""
     robots = _active_robots(status)
     count = sum(robot.facts is not None and robot.facts.is_installed for robot in robots)
     none = "no computer has udp_mesh" if _answered_computers(status).count else "no computer answers"
@@ -131,7 +131,7 @@ def _installed(status: FleetStatus) -> _Answers:
 
 
 def _answered_daemons(status: FleetStatus) -> _Answers:
-    """Of the daemons of active robots."""
+    """Answers of the daemons of active robots."""
     robots = _active_robots(status)
     count = sum(robot.facts is not None and robot.facts.answers for robot in robots)
     return _Answers(count, len(robots), "no daemon answers")

@@ -55,7 +55,7 @@ def _as_object(answer: RawObservation | NoAnswer) -> dict[str, object]:
 
 @dataclass(frozen=True, slots=True)
 class SiteAnswers:
-    """What a worker passes on: each node's answer, and how many bytes went to and came from each device there."""
+    """The answers that a worker passes on: one per node, and how many bytes went to and came from each device there."""
 
     answers: dict[str, Observation | NoAnswer]
     sent_bytes: dict[str, int]
@@ -114,7 +114,7 @@ class SiteObserver:
         return site.name if site is not None and site.worker_key else ""
 
     def observe(self, name: str, nodes: Sequence[str]) -> Mapping[str, Observation | NoAnswer]:
-        """What these nodes of a site answer its worker. Raises NodeError: the worker could not be asked."""
+        """The answers of these nodes of a site to its worker. Raises NodeError: the worker could not be asked."""
         site, asked, now_s = self.fleet.sites[name], tuple(nodes), self.monotonic()
         kept = self._answers.get(name)
         if kept is not None and kept.nodes == asked and now_s - kept.asked_s < PERIOD_S:

@@ -10,7 +10,7 @@ from meshctl.status.values import Alarm, Level
 
 
 def thin_alarms(facts: RobotFacts) -> Iterator[Alarm]:
-    """Of the status that its daemon gave; a daemon without thin links, or of an earlier version, has none."""
+    """Alarms from the status of its daemon; a daemon without thin links, or of an earlier version, has none."""
     thin = facts.status.get("thin")
     if not isinstance(thin, Mapping):
         return

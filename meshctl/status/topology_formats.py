@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from meshctl.report.duration import duration
-from meshctl.topology import Graph, Report, neighbours_of
+from meshctl.topology import Graph, Report, heard_by_name
 from meshctl.topology.cells import LinkCell
 from meshctl.wording import counted
 
@@ -68,7 +68,7 @@ def directions(reports: Mapping[str, Report], macs: Mapping[str, str]) -> dict[t
     return {
         (name, other): Direction(heard.quality, heard.signal_dbm, heard.last_seen_ms)
         for name, report in reports.items()
-        for other, heard in neighbours_of(report, macs).items()
+        for other, heard in heard_by_name(report, macs).items()
     }
 
 
@@ -90,8 +90,8 @@ def table(view: TopologyView) -> str:
         )  # fmt: skip
     widths = [max(len(line[column]) for line in lines) for column in range(len(lines[0]))]
     links = ["  ".join(c.ljust(w) for c, w in zip(line, widths, strict=True)).rstrip() for line in lines]
-    cuts = view.graph.cut_off_by_any(view.entries)
-    notes = [f"cut vertex: {name} (connects {', '.join(lost)})" for name, lost in cuts.items()]
+    cut_off_by = view.graph.cut_off_by_any(view.entries)
+    notes = [f"cut vertex: {name} (connects {', '.join(lost)})" for name, lost in cut_off_by.items()]
     return "\n".join([*links, *notes])
 
 
@@ -102,11 +102,11 @@ def tree(view: TopologyView) -> str:
     for name, path in sorted(paths.items()):
         if path.hops:
             children.setdefault(path.via, []).append(name)
-    cuts = view.graph.cut_off_by_any(view.entries)
+    cut_off_by = view.graph.cut_off_by_any(view.entries)
     lines: list[str] = []
 
     def label(name: str) -> str:
-        star = " *" if name in cuts else ""
+        star = " *" if name in cut_off_by else ""
         path = paths[name]
         text = "" if not path.hops else f"  {counted(path.hops, 'hop')}, {path.quality:.0%}"
         silent = ", does not answer" if view.was_queried(name) else ", not queried"
@@ -127,21 +127,21 @@ def tree(view: TopologyView) -> str:
     # links that only other nodes report are missing
     among = "" if view.queried is None else " among the links that the selected nodes report"
     lines += [f"no path to {' or '.join(view.entries) or 'the base'}{among}: {', '.join(apart)}"] if apart else []
-    lines += [f"* cut vertex{among}: others reach the base only through it"] if cuts else []
+    lines += [f"* cut vertex{among}: others reach the base only through it"] if cut_off_by else []
     return "\n".join(lines)
 
 
 def as_json(view: TopologyView) -> str:
     """Nodes, and links with both directions."""
     paths = view.graph.paths_to_any(view.entries)
-    cuts = view.graph.cut_off_by_any(view.entries)
+    cut_off_by = view.graph.cut_off_by_any(view.entries)
     nodes: list[dict[str, Any]] = [
         {
             "name": name, "address": view.addresses.get(name), "age_s": view.age_s(name),
             "hops": paths[name].hops if name in paths else None,
             "quality": round(paths[name].quality, 4) if name in paths else None,
             "via": paths[name].via if name in paths and paths[name].hops else None,
-            "cuts_off": list(cuts.get(name, ())),
+            "cuts_off": list(cut_off_by.get(name, ())),
         }
         for name in view.graph.nodes
     ]  # fmt: skip
@@ -199,10 +199,10 @@ def netjson(view: TopologyView) -> str:
 
 def dot(view: TopologyView) -> str:
     """Graphviz: cut vertices as boxes, quality as label and thickness."""
-    cuts = view.graph.cut_off_by_any(view.entries)
+    cut_off_by = view.graph.cut_off_by_any(view.entries)
     lines = [f"graph {json.dumps(view.mesh)} {{"]
     for name in view.graph.nodes:
-        shape = "doublecircle" if name in view.entries else "box" if name in cuts else "ellipse"
+        shape = "doublecircle" if name in view.entries else "box" if name in cut_off_by else "ellipse"
         lines.append(f"  {json.dumps(name)} [shape={shape}];")
     for link in view.graph.links:
         style = (

@@ -3,12 +3,12 @@
 from meshctl.topology.alternate_macs import alternate_macs, with_alternates
 from meshctl.topology.graph import EMPTY, Graph, Link, Path, graph_of
 from meshctl.topology.observed import (
-    NEIGHBOUR_FRESH_MS,
+    NEIGHBOR_FRESH_MS,
     HeardNeighbor,
     Report,
     Sighting,
+    heard_by_name,
     names_by_mac,
-    neighbours_of,
     observed_graph,
     seen_by,
 )
@@ -16,7 +16,7 @@ from meshctl.topology.reports import mesh_macs, report_of
 
 __all__ = [
     "EMPTY",
-    "NEIGHBOUR_FRESH_MS",
+    "NEIGHBOR_FRESH_MS",
     "Graph",
     "HeardNeighbor",
     "Link",
@@ -25,9 +25,9 @@ __all__ = [
     "Sighting",
     "alternate_macs",
     "graph_of",
+    "heard_by_name",
     "mesh_macs",
     "names_by_mac",
-    "neighbours_of",
     "observed_graph",
     "report_of",
     "seen_by",

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 from meshctl.device.observation import Observation
 from meshctl.model import Band, Fleet, Node
-from meshctl.topology.observed import Report, neighbours_of
+from meshctl.topology.observed import Report, heard_by_name
 from meshctl.topology.reports import report_of
 
 
@@ -38,9 +38,9 @@ def within(observation: Observation, node: Node, mesh: str) -> Observation:
         macs={name: mac for name, mac in (observation.macs or {}).items() if name in names},
         links=tuple(link for link in observation.links or () if link.ifname in names),
         stations=tuple(station for station in observation.stations or () if station.ifname in names),
-        neighbours=None
-        if observation.neighbours is None
-        else tuple(n for n in observation.neighbours if n.ifname in names),
+        neighbors=None
+        if observation.neighbors is None
+        else tuple(n for n in observation.neighbors if n.ifname in names),
         originators=None
         if observation.originators is None
         else tuple(o for o in observation.originators if o.ifname in names),
@@ -64,7 +64,7 @@ def link_cells(
     found: dict[tuple[str, str], tuple[LinkCell, ...]] = {}
     for mesh in meshes:
         for name, report in mesh_reports(fleet, observations, mesh).items():
-            for other in neighbours_of(report, names):
+            for other in heard_by_name(report, names):
                 cell = LinkCell(
                     mesh, fleet.meshes[mesh].band, _channel(fleet, fleet.nodes[name], observations[name], mesh)
                 )

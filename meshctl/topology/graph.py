@@ -35,36 +35,36 @@ class Path:
 
 @dataclass(frozen=True, slots=True)
 class Graph:
-    """`neighbours[name]` maps each neighbor to the best link to it. Names are sorted, so results are deterministic."""
+    """`neighbors[name]` maps each neighbor to the best link to it. Names are sorted, so results are deterministic."""
 
-    neighbours: Mapping[str, Mapping[str, Link]] = field(default_factory=lambda: MappingProxyType({}))
+    neighbors: Mapping[str, Mapping[str, Link]] = field(default_factory=lambda: MappingProxyType({}))
 
     @property
     def nodes(self) -> tuple[str, ...]:
-        return tuple(self.neighbours)
+        return tuple(self.neighbors)
 
     @property
     def links(self) -> tuple[Link, ...]:
-        return tuple(link for name, around in self.neighbours.items() for other, link in around.items() if name < other)
+        return tuple(link for name, around in self.neighbors.items() for other, link in around.items() if name < other)
 
     def __contains__(self, name: object) -> bool:
-        return name in self.neighbours
+        return name in self.neighbors
 
     def reachable(self, entry: str, without: Iterable[str] = ()) -> frozenset[str]:
         """Every node with a path to `entry` that avoids `without`; empty if the entry is not in the graph."""
         gone = set(without)
-        if entry not in self.neighbours or entry in gone:
+        if entry not in self.neighbors or entry in gone:
             return frozenset()
         seen, waiting = {entry}, [entry]
         while waiting:
-            fresh = [other for other in self.neighbours[waiting.pop()] if other not in seen and other not in gone]
+            fresh = [other for other in self.neighbors[waiting.pop()] if other not in seen and other not in gone]
             seen.update(fresh)
             waiting.extend(fresh)
         return frozenset(seen)
 
     def paths(self, entry: str) -> dict[str, Path]:
         """The best path of every reachable node to `entry`: highest quality first, then fewest hops (Dijkstra)."""
-        if entry not in self.neighbours:
+        if entry not in self.neighbors:
             return {}
         found: dict[str, Path] = {}
         waiting: list[tuple[float, int, str, str]] = [(-1.0, 0, entry, entry)]
@@ -73,7 +73,7 @@ class Graph:
             if name in found:
                 continue
             found[name] = Path(hops, -negative, via)
-            for other, link in self.neighbours[name].items():
+            for other, link in self.neighbors[name].items():
                 if other not in found:
                     heapq.heappush(waiting, (negative * link.quality, hops + 1, other, name))
         return found
@@ -89,30 +89,30 @@ class Graph:
     def farthest_first(self, *entries: str) -> tuple[str, ...]:
         """Nodes by hops to their entry, most first; of equals the weaker path first; unreachable ones first of all."""
         paths = self.paths_to_any(entries)
-        unreachable = len(self.neighbours)
+        unreachable = len(self.neighbors)
 
         def distance(name: str) -> tuple[int, float, str]:
             path = paths.get(name)
             return (-path.hops, path.quality, name) if path else (-unreachable, 0.0, name)
 
-        return tuple(sorted(self.neighbours, key=distance))
+        return tuple(sorted(self.neighbors, key=distance))
 
     def cut_off_by(self, entry: str) -> dict[str, tuple[str, ...]]:
         """For each cut vertex in the entry's component (the entry excepted): the nodes that lose `entry` without it."""
-        if entry not in self.neighbours:
+        if entry not in self.neighbors:
             return {}
         order: dict[str, int] = {entry: 0}
         low: dict[str, int] = {entry: 0}
         visited = [entry]
         cut: dict[str, list[str]] = {}
-        stack: list[tuple[str, str, Iterator[str]]] = [(entry, "", iter(self.neighbours[entry]))]
+        stack: list[tuple[str, str, Iterator[str]]] = [(entry, "", iter(self.neighbors[entry]))]
         while stack:
             name, parent, others = stack[-1]
             for other in others:
                 if other not in order:
                     order[other] = low[other] = len(visited)
                     visited.append(other)
-                    stack.append((other, name, iter(self.neighbours[other])))
+                    stack.append((other, name, iter(self.neighbors[other])))
                     break
                 if other != parent:
                     low[name] = min(low[name], order[other])

@@ -1,6 +1,6 @@
 """The mesh graph from the nodes' reports about their neighbors.
 
-Each reachable node gives a `Report` (its mesh MACs, the neighbors it hears). `neighbours_of` maps the MACs it hears to
+Each reachable node gives a `Report` (its mesh MACs, the neighbors it hears). `heard_by_name` maps the MACs it hears to
 nodes, `observed_graph` merges both directions of a link, `seen_by` finds the nodes that still hear an unreachable one.
 """
 
@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from meshctl.topology.graph import Graph, Link, graph_of
 
 # A neighbor not heard for longer is not a link: batman-adv keeps dead ones in its tables for minutes.
-NEIGHBOUR_FRESH_MS = 10_000
+NEIGHBOR_FRESH_MS = 10_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,8 +52,8 @@ def names_by_mac(reports: Iterable[Report], known_macs: Mapping[str, str]) -> di
     return names
 
 
-def neighbours_of(
-    report: Report, names: Mapping[str, str], *, fresh_ms: int = NEIGHBOUR_FRESH_MS
+def heard_by_name(
+    report: Report, names: Mapping[str, str], *, fresh_ms: int = NEIGHBOR_FRESH_MS
 ) -> dict[str, HeardNeighbor]:
     """The neighbors a node hears now: name -> the best of the neighbor's radios, which carries the traffic.
 
@@ -95,7 +95,7 @@ def observed_graph(
     *,
     known_macs: Mapping[str, str] | None = None,
     wires: Iterable[tuple[str, str]] = (),
-    fresh_ms: int = NEIGHBOUR_FRESH_MS,
+    fresh_ms: int = NEIGHBOR_FRESH_MS,
 ) -> Graph:
     """The mesh as its nodes report it. `wires` are pairs connected by cable (two radios on a robot's switch).
 
@@ -106,7 +106,7 @@ def observed_graph(
     names = names_by_mac(known_reports, known_macs or {})
     quality: dict[tuple[str, str], float] = {}
     for report in known_reports:
-        for other, heard in neighbours_of(report, names, fresh_ms=fresh_ms).items():
+        for other, heard in heard_by_name(report, names, fresh_ms=fresh_ms).items():
             quality[report.node, other] = 1.0 if heard.quality is None else heard.quality
     links = [Link(a, b, min(value, quality.get((b, a), value))) for (a, b), value in quality.items()]
     links += [Link(a, b, 1.0, wired=True) for a, b in wires]
@@ -114,7 +114,7 @@ def observed_graph(
 
 
 def seen_by(
-    reports: Iterable[Report], known_macs: Mapping[str, str], *, fresh_ms: int = NEIGHBOUR_FRESH_MS
+    reports: Iterable[Report], known_macs: Mapping[str, str], *, fresh_ms: int = NEIGHBOR_FRESH_MS
 ) -> dict[str, tuple[Sighting, ...]]:
     """Node -> the nodes that hear it and how long ago, latest first."""
     known_reports = tuple(reports)
@@ -122,7 +122,7 @@ def seen_by(
     known = frozenset(names.values())
     sightings: dict[str, list[Sighting]] = {}
     for report in known_reports:
-        for name, heard in neighbours_of(report, names, fresh_ms=fresh_ms).items():
+        for name, heard in heard_by_name(report, names, fresh_ms=fresh_ms).items():
             if name in known:
                 sightings.setdefault(name, []).append(Sighting(report.node, heard.last_seen_ms, heard.signal_dbm))
     return {

@@ -17,7 +17,7 @@ FULL_THROUGHPUT_KBIT_S = 20_000
 def report_of(node: str, observation: Observation) -> Report:
     """The node's report: from batman-adv's tables, or from the radio's station entries if there are none."""
     signals = {station.mac.lower(): station.signal_dbm for station in observation.stations or ()}
-    if observation.neighbours is None:
+    if observation.neighbors is None:
         heard = [
             HeardNeighbor(station.mac.lower(), station.inactive_ms or 0, None, station.signal_dbm)
             for station in observation.stations or ()
@@ -29,9 +29,9 @@ def report_of(node: str, observation: Observation) -> Report:
         node,
         mesh_macs(observation),
         tuple(
-            _heard(mac, neighbour.last_seen_ms, signals.get(mac), paths.get(mac, {}))
-            for neighbour in observation.neighbours
-            for mac in (neighbour.mac.lower(),)
+            _heard(mac, neighbor.last_seen_ms, signals.get(mac), paths.get(mac, {}))
+            for neighbor in observation.neighbors
+            for mac in (neighbor.mac.lower(),)
         ),
     )
 

@@ -26,7 +26,7 @@ from typing import Any
 
 from meshlab.control import Control
 from meshlab.errors import LabError
-from meshlab.port_forwarder import lock_port
+from meshlab.listeners import Listeners, lock_port
 from meshlab.qemu import guest_protocol, initramfs
 from meshlab.qemu.qemu import TCG, Machine, cached_accelerator, find_qemu
 from meshlab.qemu.remote_exec import run_process
@@ -34,7 +34,6 @@ from meshlab.shaped_tunnel import reset
 from meshlab.spec import load
 
 log = logging.getLogger("meshlab.qemu.host_proxy")
-_BACKLOG = 16
 _CHUNK_BYTES = 1 << 16
 _POLL_S = 0.5
 # the time to boot until the supervisor is ready, under emulation on a busy host
@@ -53,8 +52,7 @@ class HostProxy:
         self._wanted_port = port
         self.port = 0
         self.stopping = asyncio.Event()
-        self._listening: dict[str, tuple[socket.socket, asyncio.Task[None]]] = {}
-        self._tunnels: set[asyncio.Task[None]] = set()
+        self._listeners: Listeners[str] = Listeners(lambda host: host, self._serve)
 
     async def run(self) -> None:
         loop = asyncio.get_running_loop()
@@ -72,10 +70,8 @@ class HostProxy:
             loop.remove_reader(machine)
             os.close(machine)
             control.close()
-            for task in (watching, *self._tunnels):
-                task.cancel()
-            self._update_listeners({})
-            await asyncio.gather(watching, *self._tunnels, return_exceptions=True)
+            watching.cancel()
+            await asyncio.gather(watching, self._listeners.close(), return_exceptions=True)
             port_lock.close()
 
     def _machine_ended(self) -> None:
@@ -118,38 +114,10 @@ class HostProxy:
                 reader, writer = await self._connect("watch")
                 try:
                     while line := await reader.readline():
-                        self._update_listeners(json.loads(line)["doors"])
+                        self._listeners.update(json.loads(line)["doors"].keys(), self.port)
                 finally:
                     writer.close()
             await asyncio.sleep(_POLL_S)
-
-    def _update_listeners(self, ports: dict[str, str]) -> None:
-        for host in self._listening.keys() - ports.keys():
-            listener, task = self._listening.pop(host)
-            task.cancel()
-            listener.close()
-        for host in ports.keys() - self._listening.keys():
-            listener = socket.socket()
-            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            try:
-                listener.bind((host, self.port))
-            except OSError as error:
-                listener.close()
-                log.error("port-in-use host=%s port=%d error=%s", host, self.port, error)
-                continue
-            listener.listen(_BACKLOG)
-            listener.setblocking(False)
-            self._listening[host] = (listener, asyncio.ensure_future(self._accept(host, listener)))
-
-    async def _accept(self, host: str, listener: socket.socket) -> None:
-        loop = asyncio.get_running_loop()
-        while True:
-            client, _ = await loop.sock_accept(listener)
-            client.setblocking(False)
-            client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            task = asyncio.ensure_future(self._serve(host, client))
-            self._tunnels.add(task)
-            task.add_done_callback(self._tunnels.discard)
 
     async def _serve(self, host: str, client: socket.socket) -> None:
         try:

@@ -10,9 +10,9 @@ import pytest
 
 from meshctl.device.connection import Completed, Connection, Endpoint
 from meshctl.device.link_table import LinkTable, read_links
-from meshctl.nodes.link_looks import HopMargins, MeshTables, assemble
+from meshctl.nodes.link_snapshots import HopMargins, MeshTables, assemble
 from meshctl.placement.ground import NodePosition
-from meshctl.placement.meter import Advice, Look, Meter
+from meshctl.placement.meter import Advice, LinkSnapshot, Meter
 from meshctl.placement.path_loss import PathLossModel
 from meshlab import placement
 from meshlab.fleet import VirtualFleet, VirtualNode
@@ -65,21 +65,21 @@ def tables(fleet: VirtualFleet) -> MeshTables:
     return MeshTables(found, macs, ("far",), "base")
 
 
-def look(fleet: VirtualFleet, margins: HopMargins, now_s: float) -> Look:
+def snapshot(fleet: VirtualFleet, margins: HopMargins, now_s: float) -> LinkSnapshot:
     x, y = fleet.positions["far"]
     return assemble(tables(fleet), margins, now_s, fresh=True, position=(x, y, 0.0))
 
 
 def test_the_meter_follows_a_robot_that_moves(row: VirtualFleet) -> None:
     meter, margins = Meter(7.0), HopMargins(7.0)
-    until(lambda: {"near"} <= set(look(row, margins, 0.0).paths), "far's path over near")
+    until(lambda: {"near"} <= set(snapshot(row, margins, 0.0).paths), "far's path over near")
     steps = (97, 101, 105, 109, 113, 117, 121)
     readings = []
     for second, x in enumerate(steps):
         lab(row, "move", "far", str(x), "0")
         (link,) = (one for one in links_of(placement.current_environment(row)) if one.ends == {"near", "far"})
         until(partial(hears, row, link.signal_at("far")), f"the signal at {x} m")
-        readings.append(meter.step(look(row, margins, float(second))))
+        readings.append(meter.step(snapshot(row, margins, float(second))))
     assert [one.next_hop for one in readings[-3:]] == ["near"] * 3
     assert readings[-1].hops == 2
     ratios = [one.snr_db for one in readings[-3:] if one.snr_db is not None]
@@ -90,7 +90,7 @@ def test_the_meter_follows_a_robot_that_moves(row: VirtualFleet) -> None:
     assert readings[0].advice is Advice.GO
     lab(row, "move", "far", "900", "0")
     until(lambda: heard(row) is None, "far to hear no one")
-    lost = [meter.step(look(row, margins, 20.0 + second)) for second in range(4)]
+    lost = [meter.step(snapshot(row, margins, 20.0 + second)) for second in range(4)]
     assert lost[-1].advice is Advice.TURN_BACK
     assert lost[-1].back_m == pytest.approx(900 - 121, abs=40)
 

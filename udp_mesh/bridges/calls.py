@@ -173,7 +173,7 @@ class Calls:
             return [Deliver(peer, message.name, message.payload)]
         pending = self._pending.get(message.number)
         if message.run != self._run or pending is None or pending.peer != peer:
-            # of an earlier run, or of a call that ended already
+            # a reply to an earlier run, or to a call that has ended
             return []
         return [self._finish(message.number, message.error, message.response)]
 

@@ -91,7 +91,7 @@ def _peer(peer: Mapping[str, Any]) -> Message:
 
 
 def _radio_path(radio: Mapping[str, Any]) -> Message:
-    """Of a collector's report; empty: nothing is known."""
+    """One path of a collector's report; empty: nothing is known."""
     trend = radio.get("trend") or {}
     names: Message = {key: radio.get(key) or "" for key in ("source", "radio", "next_hop")}
     measured = {key: _known(radio.get(key)) for key in _MEASURED}
@@ -104,7 +104,7 @@ def _radio_path(radio: Mapping[str, Any]) -> Message:
 
 
 def _radio(radio: Mapping[str, Any]) -> Message:
-    """Of a collector's report as a whole; empty: there is none."""
+    """A collector's report; empty: there is none."""
     neighbors: List[Message] = [
         {
             "name": neighbor["name"],

@@ -2,7 +2,7 @@
 
 The receiver converts, so that a topic crosses the mesh once for robots of both versions. From ROS 1 the md5sum has to
 be that of the declared definition; from ROS 2 the bytes have to match it in length and structure, because ROS 2's type
-hash says nothing about ROS 1. What is latched in one version is latched in the other.
+hash says nothing about ROS 1. A message that is latched in one version is latched in the other.
 """
 
 from __future__ import annotations

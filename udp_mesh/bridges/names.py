@@ -43,7 +43,7 @@ def outbound_name(own: str, route: Route) -> str:
 
 
 def own_prefix(own: str) -> str:
-    """What the ROS names start with on which local nodes publish, without the last slash."""
+    """The prefix of the ROS names on which local nodes publish, without the last slash."""
     return "/{}/{}".format(ros_word(own), PREFIX)
 
 

@@ -129,7 +129,7 @@ def _rotate(by: Quaternion, vector: Vector) -> Vector:
 
 
 class PositionThrottle:
-    """Which poses become a `set-position`: at most one per period. Positions in another frame are as good."""
+    """Chooses the poses that become a `set-position`: at most one per period, in any frame."""
 
     def __init__(self) -> None:
         self._set_at = -math.inf

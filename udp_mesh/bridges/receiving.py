@@ -1,4 +1,4 @@
-"""Which mesh topics a bridge publishes locally, and no more of them than it wants. Pure.
+"""The mesh topics that a bridge publishes locally, and how much of them. Pure.
 
 Peers send only what programs read: a bridge that reads `*` gets everything. In options and parameters an entry is a
 topic or a pattern, with bounds: `video rate_hz=1 max_age_s=2`.

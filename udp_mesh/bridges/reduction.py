@@ -51,7 +51,7 @@ class JpegOptions(NamedTuple):
 
 
 class Reduction(NamedTuple):
-    """What to reduce of a topic. `voxel_m`: one point per cube of this edge, with `adapt` up to `max_voxel_m`;
+    """How to reduce a topic. `voxel_m`: one point per cube of this edge, with `adapt` up to `max_voxel_m`;
     `fields`: those of a cloud's points to keep, empty for all. `adapt` needs `rate_hz`."""
 
     rate_hz: Optional[float] = None
@@ -132,7 +132,7 @@ class DetailController:
     def _move(self, change: float) -> None:
         moved = min(1.0, max(0.0, self.detail + change))
         if change < 0 and moved != self.detail:
-            # what follows tells about the smaller messages
+            # the next outcomes are those of the smaller messages
             self._latencies.clear()
         self.detail = moved
 

@@ -1,4 +1,4 @@
-"""What a user publishes or configures without effect, as lines for the bridge's log. Pure.
+"""Find messages and settings without effect, as lines for the bridge's log. Pure.
 
 To ROS, a name that is spelled differently from the daemon's topic is no error, but a topic that nothing reads.
 """

@@ -4,7 +4,7 @@ from udp_mesh.client.mesh_client import MeshError
 
 
 def hint(error: MeshError) -> str:
-    """What to do about an error, if known."""
+    """The remedy for an error, if known."""
     match error.code, error.__cause__:
         case "unreachable", PermissionError():
             return "run as root or as a member of the group in `socket_group` of [daemon]"

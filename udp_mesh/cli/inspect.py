@@ -63,20 +63,20 @@ def _show(arguments: argparse.Namespace, op: str, view: Callable[[Json], str]) -
 def _watch(arguments: argparse.Namespace, op: str, view: Callable[[Json], str]) -> NoReturn:
     """Runs until Ctrl-C. Once connected, waits for a daemon that goes away: it may be restarting."""
     period_s: float = arguments.watch
-    seen = is_away = False
+    was_connected = is_away = False
     while True:
         try:
             with MeshClient(arguments.socket) as mesh:
                 while True:
                     reply = _request(mesh, op)
-                    seen, is_away = True, False
+                    was_connected, is_away = True, False
                     if arguments.json:
                         print_json_line(reply)
                     else:
                         _redraw(view(reply))
                     time.sleep(period_s)
         except MeshError as error:
-            if error.code != "unreachable" or not seen:
+            if error.code != "unreachable" or not was_connected:
                 raise
             if not is_away and not arguments.json:
                 _redraw(f"{error}; waiting for the daemon")

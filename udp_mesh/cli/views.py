@@ -148,10 +148,10 @@ def status_view(status: Json) -> str:
     lines += ["", peers_view(conditions["peers"])]
     mtus = {link["name"]: link["mtu"] for link in status["links"]}
     lines += [
-        f"the path to {peer['name']} carries packets of {peer['path_mtu_bytes']} bytes at most, link {peer['link']} "
-        f"{mtus[peer['link']]}"
+        f"path to {peer['name']}: packets of at most {peer['path_mtu_bytes']} bytes "
+        f"(MTU of {peer['link']}: {mtus[peer['link']]})"
         for peer in conditions["peers"]
-        # Daemons of earlier versions do not tell; a relayed path has no link of its own.
+        # Earlier daemons do not report it; a relayed path has no link of its own.
         if peer.get("path_mtu_bytes") and peer["path_mtu_bytes"] < mtus.get(peer["link"], 0)
     ]
     radio = conditions.get("radio")

@@ -327,7 +327,8 @@ class MeshClient:
             raise self._gone("the daemon closed the connection: {}".format(error.strerror)) from error
 
     def _wait_for(self, take: Callable[[], Optional[T]], timeout_s: Optional[float]) -> Optional[T]:
-        """What `take` finds among what arrived; None after `timeout_s` seconds. One of the threads that wait reads."""
+        """Waits until `take` finds something among the received frames; None after `timeout_s` seconds. One of the
+        threads that wait reads."""
         deadline = None if timeout_s is None else time.monotonic() + timeout_s
         with self._arrived:
             while True:

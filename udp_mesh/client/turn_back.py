@@ -72,7 +72,7 @@ def decide(peer: Optional[Mapping[str, Any]], need: Need, before: bool) -> Decis
 
 
 def judge_radio(radio: Optional[Mapping[str, Any]], need: Need, before: bool) -> Optional[Decision]:
-    """What the radio margin alone says; None if it is not needed, or not known."""
+    """The decision from the radio margin alone; None if no margin is required or known."""
     if need.margin_db is None or radio is None or radio["margin_db"] is None:
         return None
     margin_db, left_db = radio["margin_db"], radio["margin_db"] - need.margin_db

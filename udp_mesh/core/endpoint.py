@@ -155,7 +155,7 @@ class Endpoint:
     def is_quiet(self) -> bool:
         """Whether there is nothing to send and no event until `next_timer`, so that the driver may skip the node.
 
-        True after most bulk datagrams, of which only every few request an acknowledgement.
+        True after most bulk datagrams, of which only every few request an acknowledgment.
         """
         if self._logs is not None and self._logs.has_work:
             return False
@@ -227,7 +227,7 @@ class Endpoint:
         return None if self.thin is None else self.thin.conditions(now)
 
     def versions(self) -> tuple[VersionConditions, ...]:
-        """What was sent and received as versions, by topic."""
+        """Versions sent and received, by topic."""
         return self._state.versions.conditions()
 
     def conditions(self, now: float) -> Conditions:
@@ -273,11 +273,11 @@ class Endpoint:
 
     @property
     def late_acknowledgements(self) -> int:
-        """Acknowledgements so far that their receivers wanted sooner, because the driver reads too seldom for them."""
+        """Acknowledgments so far that their receivers wanted sooner, because the driver reads too seldom for them."""
         return self._state.late_acknowledgements
 
     def legacy_positions(self) -> dict[str, ReceivePosition]:
-        """What was received from each legacy peer. Save it: the next run needs it to keep their senders going."""
+        """The position of each legacy peer's messages. Save it: the next run needs it to keep their senders going."""
         return self._legacy.positions()
 
     def close(self, now: float) -> None:

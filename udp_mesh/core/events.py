@@ -147,7 +147,7 @@ class MessageReceived:
 @dataclass(frozen=True, slots=True)
 class MessageDelivered:
     """The destination's node has the complete message. If the topic's outbox is on disk, the message is safe there: the
-    receiving program took it, or the node has it on disk. `latency_s` is from `send` to the acknowledgement."""
+    receiving program took it, or the node has it on disk. `latency_s` is from `send` to the acknowledgment."""
 
     message_id: MessageId
     peer: str

@@ -1,4 +1,4 @@
-"""The frames of an opened unicast datagram: fragments to reassembly, acknowledgements to the sender, requests answered.
+"""The frames of an opened unicast datagram: fragments to reassembly, acknowledgments to the sender, requests answered.
 
 `deliver` turns complete messages into events; `inflate_step` does so for compressed ones, step by step.
 """

@@ -44,7 +44,7 @@ class Measure(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Trend:
-    """Of the last `WINDOW_S`."""
+    """The trend over the last `WINDOW_S`."""
 
     direction: Direction
     measure: Measure

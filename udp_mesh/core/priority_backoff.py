@@ -1,6 +1,6 @@
 """Priority backoff between nodes: while urgent levels wait elsewhere, less urgent levels are held back here.
 
-Each node reports in heartbeats and acknowledgements which urgent levels wait at it, and for how long. Nodes that hear
+Each node reports in heartbeats and acknowledgments which urgent levels wait at it, and for how long. Nodes that hear
 this hold back their own less urgent levels for `yield_hold_s`, but never for more than `yield_share` of the time, so
 that none starves.
 """

@@ -1,10 +1,10 @@
 """Datagrams in: header -> channel -> opened frames -> effects. Never raises, whatever arrives.
 
-1. A short header's tag selects candidate channels; opening one authenticates the sender. Of replays, few are decrypted
-   (`receiver.copies`).
+1. A short header's tag selects candidate channels; opening one authenticates the sender. Few replays are
+   decrypted (`receiver.copies`).
 2. A plain fragment goes straight to reassembly; other frames are decoded and go to `frame_handlers`.
 3. A long header introduces a boot: its check is verified before anything is derived or stored for it.
-4. What a boot sends before its first contact is proven is held, then processed as if it had just arrived.
+4. Datagrams of a boot before its first contact is proven are held, then processed as if they had just arrived.
 """
 
 from udp_mesh.core.frame_handlers import ack_mid_batch, deliver, process_frames
@@ -298,7 +298,8 @@ def _process_introduction(
 
 
 def _release_held(state: State, session: Session, now: float) -> None:
-    """Process what came before the first contact was proven. What turns out to be a recording is dropped as late."""
+    """Process the datagrams that came before the first contact was proven. Recordings among them are dropped as
+    late."""
     held, session.held = session.held, []
     for datagram in held:
         number, frames, link, source, introduced = datagram

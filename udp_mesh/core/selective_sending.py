@@ -1,8 +1,7 @@
 """Connects subscriptions with the rest of a node: tables asked for, answered and taken in; withheld messages released.
 
-`publish` asks `State.selection` about each message. What that withholds is admitted again here, when it is due or when
-the peer's table changes.
-"""
+`publish` asks `State.selection` about each message. Messages that it withholds are admitted again here, when they are
+due or the peer's table changes."""
 
 from __future__ import annotations
 
@@ -50,7 +49,7 @@ class SelectiveSending:
         self._state.selection.apply(self._state.settings)
 
     def set_subscriptions(self, subscriptions: Iterable[Subscription], now: float) -> None:
-        """What the programs of this node read from now on. Until the first call, everything."""
+        """Set what the programs of this node read from now on. Until the first call, they read everything."""
         self._own.set(subscriptions, now)
 
     @property

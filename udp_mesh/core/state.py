@@ -84,7 +84,7 @@ class State:
         """Sessions with a message being inflated."""
         self.broadcast_channel = SendChannel(self.keys[0], boot_id)
         self.late_acknowledgements = 0
-        """Acknowledgements sent so far of which `AckState.is_late` was true."""
+        """Acknowledgments sent so far of which `AckState.is_late` was true."""
         self.priority_backoff = PriorityBackoff(settings.rates, now)
         self.repairs: dict[bytes, NackRepair] = {}
         """By the sender's boot id."""
@@ -99,7 +99,7 @@ class State:
         self.ready: dict[Peer, None] = {}
         """Peers to which something may be ready to send."""
         self.control_ready: dict[Session, None] = {}
-        """Sessions with an acknowledgement or control frames to send now."""
+        """Sessions with an acknowledgment or control frames to send now."""
         self.outgoing: list[Datagram] = []
         """Datagrams already built: heartbeats, redundant copies."""
         self.relayed: list[tuple[int, Datagram]] = []
@@ -170,7 +170,7 @@ class State:
             self.maintenance_at = min(self.maintenance_at, repairs.next_at)
 
     def schedule_control(self, session: Session) -> None:
-        """Mark the session as having an acknowledgement or control frames to send."""
+        """Mark the session as having an acknowledgment or control frames to send."""
         self.control_ready[session] = None
 
     def waiting_senders(self) -> Iterator[Sender]:

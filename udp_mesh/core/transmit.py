@@ -1,8 +1,8 @@
 """Datagrams out and timers: what is sent now, most urgent first, and when the next timer is due.
 
-One call of `collect` returns datagrams already built (heartbeats), then acknowledgements and control frames, redundant
+One call of `collect` returns datagrams already built (heartbeats), then acknowledgments and control frames, redundant
 copies, and finally level by level broadcasts and the peers in turn. A peer with nothing more to send leaves
-`State.ready` until an acknowledgement, a timer or a new message returns it.
+`State.ready` until an acknowledgment, a timer or a new message returns it.
 """
 
 from heapq import heappop
@@ -83,13 +83,13 @@ def _restore(state: State, name: str, message: OutgoingMessage) -> None:
 
 
 def _send_control(state: State, session: Session, now: float, out: list[Datagram]) -> None:
-    """Send a session's acknowledgement and control frames in as few datagrams as possible."""
+    """Send a session's acknowledgment and control frames in as few datagrams as possible."""
     path = session.path
     peer = session.peer
     if not path.link or peer is None or peer.session is not session:
         # The packet numbers of an earlier boot are not those that the sender keeps account of.
         return
-    # Acknowledgements from the middle of a batch among them: after a later one their packets would count as lost.
+    # Acknowledgments from the middle of a batch among them: after a later one their packets would count as lost.
     frames = list(session.pending_control)
     session.pending_control.clear()
     if session.receiver.acks.pending or session.receiver.acks.send_now:

@@ -62,7 +62,7 @@ class ReplayError(OpenError):
 
 
 class _Channel:
-    """What both ends derive: cipher, nonce salt and the public tag.
+    """The values that both ends derive: cipher, nonce salt and the public tag.
 
     The cipher is created on first use: in a large team most nodes never send each other anything.
     """

@@ -82,8 +82,8 @@ class ReplayWindow:
         return True
 
     def accepted_share(self, first: int, newest: int, least: int) -> float | None:
-        """Which share of the numbers up to the largest one was accepted, of at most the `newest` ones and of those from
-        `first` on; None if these are fewer than `least`."""
+        """The share of the numbers up to the largest one that was accepted, of at most the `newest` ones and of those
+        from `first` on; None if these are fewer than `least`."""
         start = max(first, self.largest - min(newest, WINDOW_PACKETS) + 1)
         count = self.largest - start + 1
         if count < least:

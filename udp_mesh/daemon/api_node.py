@@ -133,7 +133,8 @@ class Node:
             del self._outcomes[outcome, to]
 
     async def messages(self) -> AsyncIterator[MessageReceived]:
-        """Messages in order of completion, until the node is closed. What is yielded is delivered."""
+        """Messages in order of completion, until the node is closed. A message counts as delivered once it is
+        yielded."""
         while True:
             while self._messages:
                 message = self._messages.popleft()

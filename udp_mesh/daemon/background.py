@@ -26,7 +26,7 @@ class BackgroundThread:
         return future.done
 
     def close(self) -> None:
-        """What has not begun is dropped; what runs ends by itself."""
+        """Calls that have not begun are dropped; a running one ends by itself."""
         self._threads.shutdown(wait=False, cancel_futures=True)
 
     def _done(self, future: Future[None]) -> None:

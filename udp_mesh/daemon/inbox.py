@@ -141,7 +141,7 @@ class Inbox:
         return None if held is None or held.reading else held.topic
 
     def item(self, key: int) -> LoggedItem | None:
-        """Which item of a log the message is; None if it is none."""
+        """The item of a log that the message is; None if it is not one."""
         held = self._held.get(key)
         return None if held is None else held.item
 
@@ -181,7 +181,7 @@ class Inbox:
             self._store.remove(key)
 
     def client_gone(self, client: Client) -> None:
-        """What the client has not taken goes to another one."""
+        """Messages that the client has not taken go to another one."""
         self.take_read()
         for key, held in list(self._held.items()):
             if held.reading.pop(client, 0) != 0 and not held.reading and not held.on_disk and held.item is None:

@@ -1,6 +1,6 @@
 """Sends datagrams over the links; those that a full socket does not take wait in a short queue.
 
-A full socket never blocks the other links. What the kernel refuses is counted and logged (`send_errors`).
+A full socket never blocks the other links. Datagrams that the kernel refuses are counted and logged (`send_errors`).
 """
 
 from __future__ import annotations

@@ -46,7 +46,7 @@ def _join_log(memory: sqlite3.Connection, disk: sqlite3.Connection, log: int, ke
 
 
 def with_earlier(connection: sqlite3.Connection, log: int, remembered: RememberedLog) -> RememberedLog:
-    """What is remembered of a log, with what the database remembers of it."""
+    """The record of a log, merged with the one in the database."""
     (received,) = connection.execute("SELECT dropped FROM logs WHERE id = ?", (log,)).fetchone()
     carried = connection.execute("SELECT ranges FROM carried WHERE log = ?", (log,)).fetchone()
     return RememberedLog(

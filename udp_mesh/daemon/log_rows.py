@@ -1,7 +1,7 @@
 """The rows of the database of shared logs -> what the store held, checked.
 
 SQLite takes any value in any column, and a file may have been changed by hand. A row that makes no sense is left
-out and reported; all others are kept. What a row says about numbers is never taken for less than it may have been: if
+out and reported; all others are kept. Numbers in a row are never underestimated: if
 the numbers that this node used are in doubt, its logs get a new identity, as after the loss of a disk.
 """
 
@@ -42,7 +42,7 @@ MAX_PROBLEMS = 20
 
 @dataclass(slots=True)
 class LoadedRows:
-    """What was read. `orphans` are items that no row assigns to a log."""
+    """The rows that were read. `orphans` are items that no row assigns to a log."""
 
     contents: LogContents
     problems: list[str]

@@ -1,4 +1,4 @@
-"""Which clients hear of the outcomes of the messages that they published."""
+"""The clients to inform of the outcomes of the messages that they published."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class AwaitedOutcomes:
             self._to_several.popitem(last=False)
 
     def publisher(self, message: int) -> Publisher | None:
-        """Whom to inform of an outcome of the message; None: no client asked."""
+        """The client to inform of an outcome of the message; None: no client asked."""
         return self._to_one.pop(message, None) or self._to_several.get(message)
 
     def remove_client(self, client: Client) -> None:

@@ -1,4 +1,4 @@
-"""Which local programs receive which messages: live ones, and those that the inbox holds for them."""
+"""Pass messages to local programs: live ones, and those that the inbox holds for them."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ class Subscriptions:
         self._changed()
 
     def read_here(self) -> list[Subscription]:
-        """What programs read, other than what never crosses the network; everything if it is more than a peer accepts:
+        """Subscriptions of programs to topics that cross the network; everything if they are more than a peer accepts:
         every change goes through all clients' patterns."""
         found: dict[str, Bounds] = {}
         for patterns in self._patterns.values():

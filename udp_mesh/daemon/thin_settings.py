@@ -81,7 +81,7 @@ def _read_link(table: Table) -> tuple[ThinLinkSettings, ThinPortConfig]:
 
 @dataclass(frozen=True, slots=True)
 class _Air:
-    """What a link's settings are unless they are configured."""
+    """Defaults of a link's settings."""
 
     usual_frame_bytes: int
     overhead_bytes: int

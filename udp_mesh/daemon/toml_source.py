@@ -336,7 +336,7 @@ def may_be_key(text: str) -> bool:
 
 
 def show(value: object) -> str:
-    """A value as written in the file, truncated to one line. What may be a key is not shown."""
+    """A value as written in the file, truncated to one line. Text that may be a key is not shown."""
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, dict):

@@ -266,7 +266,7 @@ class UdpLink:
     def _run_end(self, datagrams: Sequence[OutgoingDatagram], start: int) -> int:
         """The end of the run from `start`: same destination and urgency, same size; the last one may be shorter.
 
-        Of urgent ones it may not: probes of several sizes are sent together, and a router may drop a run for its
+        In an urgent run it may not: probes of several sizes are sent together, and a router may drop a run for its
         largest datagram before it is segmented.
         """
         first = datagrams[start]

@@ -65,7 +65,7 @@ RADIO_SAMPLED: tuple[tuple[str, float], ...] = (("margin_db", 1), ("signal_dbm",
 
 @dataclass(slots=True)
 class ReceivedTopic:
-    """What was received of one topic."""
+    """Messages received of one topic."""
 
     priority: int = 0
     messages: int = 0
@@ -74,8 +74,8 @@ class ReceivedTopic:
 
 @dataclass(slots=True)
 class SentTopic:
-    """What this node sent of one topic, and the outcomes, which count destinations; a single-datagram broadcast has
-    none. `latencies_s` are those of delivered messages."""
+    """Messages that this node sent of one topic, and the outcomes, which count destinations; a single-datagram
+    broadcast has none. `latencies_s` are those of delivered messages."""
 
     priority: int | None = None
     messages: int = 0

@@ -8,7 +8,7 @@ MAX_BYTES = 1 << 50
 
 
 class UnreadableError(ValueError):
-    """What was expected, and what was found."""
+    """A value that cannot be read: what was expected, and what was found."""
 
     def __init__(self, expected: str, found: object) -> None:
         text = found if isinstance(found, str) else repr(found)

@@ -55,7 +55,7 @@ def intervals(recording: Recording) -> list[Intervals]:
 
 
 def online_share(times: OnlineTimes, end_s: float) -> float:
-    """Of the time from a peer's first appearance to the end."""
+    """The share of the time from a peer's first appearance to the end."""
     whole_s = end_s - times.first_s
     return times.online_s / whole_s if whole_s > 0 else 1.0
 
@@ -76,7 +76,7 @@ def sent_topics(recording: Recording) -> list[tuple[str, SentTopic]]:
 
 
 def differences(recording: Recording) -> list[tuple[str, VersionTotals]]:
-    """What each topic with `delta` sent during the recording, by topic."""
+    """Versions sent during the recording, by topic with `delta`."""
     spans = ((topic, last.since(first)) for topic, (first, last) in sorted(recording.versions.items()))
     return [(topic, totals) for topic, totals in spans if totals.whole or totals.differences]
 

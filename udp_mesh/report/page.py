@@ -14,7 +14,7 @@ ValueError for recordings that it cannot show."""
 
 
 def page_writer() -> WritePage | None:
-    """What writes the page; None if meshctl is not installed."""
+    """The function that writes the page; None if meshctl is not installed."""
     from importlib.metadata import entry_points
 
     for entry in entry_points(group=GROUP, name="page"):

@@ -64,7 +64,7 @@ class RadioPathUse:
 
     @property
     def worsening_share(self) -> float:
-        """Of the samples, those in which the signal was falling."""
+        """The share of samples in which the signal was falling."""
         return self.worsening / self.samples if self.samples else 0.0
 
 
@@ -73,7 +73,7 @@ def _least(known: float | None, value: float) -> float:
 
 
 def radio_sample(t: float, peer: str, entry: object) -> RadioSample | None:
-    """Of a peer's `radio`; None if nothing is known. Raises UnreadableError."""
+    """The sample in a peer's `radio`; None if nothing is known. Raises UnreadableError."""
     if entry is None:
         return None
     if not isinstance(entry, dict):
@@ -89,7 +89,7 @@ def radio_sample(t: float, peer: str, entry: object) -> RadioSample | None:
 
 
 def radio_problem(entry: object) -> str:
-    """Of the conditions' `radio`: why a radio gave no new values; empty if they did, or nothing is known."""
+    """Why a radio gave no new values, from the conditions' `radio`; empty if it did, or nothing is known."""
     if entry is None:
         return ""
     if not isinstance(entry, dict):

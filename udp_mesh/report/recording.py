@@ -57,7 +57,7 @@ class RecordedArrival:
 
 @dataclass(frozen=True, slots=True)
 class VersionTotals:
-    """What was sent of a topic with `delta` since the daemon's start."""
+    """Versions of a topic with `delta` sent since the daemon's start."""
 
     whole: int = 0
     differences: int = 0
@@ -132,7 +132,7 @@ class SentOutcome:
 
 @dataclass(frozen=True, slots=True)
 class SavedTotals:
-    """What a peer was not sent because no program there wants it, since the daemon's start."""
+    """Messages that a peer was not sent because no program there wants them, since the daemon's start."""
 
     messages: int = 0
     bytes: int = 0
@@ -273,7 +273,7 @@ class RecordingReader:
                 yield InvalidLine(f"{self._file}:{line_number}: {error}")
 
     def _items(self, entry: dict[str, Any]) -> Iterator[Item]:
-        """Of one line."""
+        """The items of one line."""
         t, kind = number(entry, "t", 0.0, MAX_T_S), entry.get("kind")
         at = text(entry, "at") if "at" in entry else self.name
         match kind:

@@ -17,7 +17,7 @@ MAX_AIRTIME_S = 1e9
 
 @dataclass(frozen=True, slots=True)
 class ThinLinkTotals:
-    """What a thin link did since the daemon's start."""
+    """Totals of a thin link since the daemon's start."""
 
     airtime_s: float = 0.0
     frames_sent: int = 0
@@ -30,7 +30,7 @@ class ThinLinkTotals:
     messages_dropped: int = 0
 
     def since(self, earlier: ThinLinkTotals) -> ThinLinkTotals:
-        """What was added."""
+        """The difference from earlier totals."""
         return ThinLinkTotals(*(getattr(self, field.name) - getattr(earlier, field.name) for field in fields(self)))
 
 
@@ -74,7 +74,7 @@ class ThinLinkUse:
 
     @property
     def totals(self) -> ThinLinkTotals:
-        """What the link did during the recording."""
+        """Totals of the link during the recording."""
         return self.last.totals.since(self.first.totals)
 
     @property
@@ -87,7 +87,7 @@ _COUNTERS = tuple(field.name for field in fields(ThinLinkTotals) if field.name !
 
 
 def thin_items(t: float, entry: object) -> Iterator[ThinLinkSample | ThinPeerSample]:
-    """What the conditions at `t` say of thin links. Raises UnreadableError."""
+    """Samples of thin links in the conditions at `t`. Raises UnreadableError."""
     if not isinstance(entry, dict):
         raise UnreadableError("an object as thin", entry)
     for row in rows(entry, "links"):

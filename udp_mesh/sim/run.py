@@ -39,7 +39,7 @@ SAMPLE_S = 1.0
 
 @dataclass(slots=True)
 class TopicTotal:
-    """What all robots together received of one topic; `latencies_s` in order of arrival."""
+    """Messages of one topic that all robots together received; `latencies_s` in order of arrival."""
 
     messages: int = 0
     bytes: int = 0

@@ -174,7 +174,7 @@ class Team:
         return self._members[robot].node.conditions(self.event_queue.now)
 
     def subscribe(self, robot: str, subscriptions: Iterable[Subscription]) -> None:
-        """What the robot's programs read from now on."""
+        """Set what the robot's programs read from now on."""
         member = self._members[robot]
         member.node.selective.set_subscriptions(subscriptions, self.event_queue.now)
         self._pump(member)

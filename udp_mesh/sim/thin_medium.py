@@ -34,7 +34,7 @@ class _Station:
 
 @dataclass(slots=True)
 class ThinCounters:
-    """What happened on the channel since the start; `airtime_s` and `sent` by station."""
+    """Counters of the channel since the start; `airtime_s` and `sent` by station."""
 
     sent: Counter[str] = field(default_factory=Counter)
     airtime_s: dict[str, float] = field(default_factory=dict)

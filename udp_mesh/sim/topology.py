@@ -162,7 +162,7 @@ class Topology:
         return True
 
     def pump(self, name: str) -> None:
-        """What a driver does after it called a node: send its datagrams, fetch its events, set its timer."""
+        """Do what a driver does after it called a node: send its datagrams, fetch its events, set its timer."""
         node = self.nodes.get(name)
         if node is None:
             return

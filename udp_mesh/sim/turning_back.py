@@ -25,7 +25,7 @@ DECISION_S = 1.0
 
 @dataclass(frozen=True, slots=True)
 class TurnBack:
-    """What a robot needs of its link to `peer`."""
+    """A robot's requirements for its link to `peer`."""
 
     peer: str
     need: Need
@@ -74,7 +74,7 @@ class DrivenPath:
 
 
 def as_shown(peer: PeerConditions) -> Mapping[str, Any]:
-    """What `decide` reads of a peer, as in the daemon's JSON."""
+    """The fields of a peer that `decide` reads, as in the daemon's JSON."""
     trend = peer.trend
     return {
         "online": peer.online,

@@ -150,7 +150,7 @@ class Fragment(NamedTuple):
 
 
 class Ack(NamedTuple):
-    """Which packets of the reverse channel arrived."""
+    """The packets of the reverse channel that arrived."""
 
     largest: int
     """Largest packet number received (48 bits)."""

@@ -1,4 +1,4 @@
-"""Messages between relays and their neighbors: hellos, carried datagrams, acknowledgements of one hop.
+"""Messages between relays and their neighbors: hellos, carried datagrams, acknowledgments of one hop.
 
 A relay datagram is the byte `RELAY_BYTE` and a sealed datagram of kind HELLO or DATA under a relay key (`core.relaying`
 derives it); what is sealed is one of the values below. A `Carry` holds a datagram that is sealed end to end, so a relay
@@ -101,12 +101,12 @@ class Carry(NamedTuple):
 
 
 class HopAck(NamedTuple):
-    """The newest carried datagram that arrived from the receiver of this acknowledgement."""
+    """The newest carried datagram that arrived from the receiver of this acknowledgment."""
 
     largest: int
     """Its packet number in the channel of this hop."""
     delay_us: int
-    """From its arrival to this acknowledgement."""
+    """From its arrival to this acknowledgment."""
 
 
 RelayFrame: TypeAlias = RelayHello | Carry | HopAck
@@ -152,7 +152,7 @@ def encode_hop_ack(ack: HopAck) -> bytes:
 
 
 def decode_relay(data: bytes | memoryview) -> RelayFrame:
-    """What an opened relay datagram holds; a carried datagram is a view into `data`. Raises `DecodeError`."""
+    """The frame in an opened relay datagram; a carried datagram is a view into `data`. Raises `DecodeError`."""
     reader = Reader(data)
     kind = reader.integer(1, "relay frame type")
     match kind:
@@ -161,10 +161,10 @@ def decode_relay(data: bytes | memoryview) -> RelayFrame:
         case 2:
             return _decode_carry(reader)
         case 3:
-            frame = HopAck(reader.integer(6, "largest packet"), reader.integer(3, "acknowledgement delay"))
+            frame = HopAck(reader.integer(6, "largest packet"), reader.integer(3, "acknowledgment delay"))
         case _:
             raise DecodeError(f"relay frame type: expected 1-3, found {kind}")
-    # What follows a hello or an acknowledgement is of a later version.
+    # What follows a hello or an acknowledgment is of a later version.
     return frame
 
 

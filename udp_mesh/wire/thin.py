@@ -75,7 +75,7 @@ class HeardFrom(NamedTuple):
 
 
 class ThinPresence(NamedTuple):
-    """Who the sender is and whom it hears; only in introductions."""
+    """The sender's name and the nodes it hears; only in introductions."""
 
     name: str
     interval_s: int
@@ -84,7 +84,7 @@ class ThinPresence(NamedTuple):
 
 
 class ThinAck(NamedTuple):
-    """What arrived of a message of the node `number`: all (`parts` None), or the parts whose bits are set."""
+    """The parts of a message of node `number` that arrived: all (`parts` None), or the parts whose bits are set."""
 
     number: int
     message: int

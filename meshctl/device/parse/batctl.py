@@ -8,7 +8,7 @@ from functools import partial
 from types import MappingProxyType, NoneType
 from typing import Any
 
-from meshctl.device.observation import MeshInfo, MeshNeighbour, Originator
+from meshctl.device.observation import MeshInfo, MeshNeighbor, Originator
 from meshctl.device.parse.jsontext import integer, mapping, maps, parse_json, string
 
 _MAC = r"((?:[0-9a-f]{2}:){5}[0-9a-f]{2})"
@@ -18,8 +18,8 @@ _ORIGINATOR = re.compile(
     rf"^ ?(\*?) *{_MAC} +{_SEEN} +\( *(\d{{1,9}})(?:\.(\d))?\) +{_MAC} +\[ *(\S+)\]", re.IGNORECASE
 )
 # BATMAN_IV: `        mesh0<tab>  02:..:02    0.120s`; BATMAN_V: `02:..:02    0.120s (    10.4) [     mesh0]`
-_NEIGHBOUR_IV = re.compile(rf"^ *(\S+)\s+{_MAC} +{_SEEN}", re.IGNORECASE)
-_NEIGHBOUR_V = re.compile(rf"^ *{_MAC} +{_SEEN} +\([^)]*\) +\[ *(\S+)\]", re.IGNORECASE)
+_NEIGHBOR_IV = re.compile(rf"^ *(\S+)\s+{_MAC} +{_SEEN}", re.IGNORECASE)
+_NEIGHBOR_V = re.compile(rf"^ *{_MAC} +{_SEEN} +\([^)]*\) +\[ *(\S+)\]", re.IGNORECASE)
 _HEADER = re.compile(r"\[B\.A\.T\.M\.A\.N\. adv ([^,]+),.*?(BATMAN_I?V)\)?")
 
 
@@ -74,13 +74,13 @@ def parse_interfaces_text(text: str) -> tuple[str, ...] | None:
     return tuple(line.split(":", 1)[0].strip() for line in lines)
 
 
-def parse_neighbours_json(text: str, names: Mapping[int, str]) -> tuple[MeshNeighbour, ...] | None:
+def parse_neighbors_json(text: str, names: Mapping[int, str]) -> tuple[MeshNeighbor, ...] | None:
     """`neighbors_json`."""
     data = parse_json(text)
     if not isinstance(data, list):
         return None
     return tuple(
-        MeshNeighbour(
+        MeshNeighbor(
             mac=string(item.get("neigh_address")).lower(),
             ifname=_interface(item, names),
             last_seen_ms=integer(item.get("last_seen_msecs")) or 0,
@@ -90,16 +90,16 @@ def parse_neighbours_json(text: str, names: Mapping[int, str]) -> tuple[MeshNeig
     )
 
 
-def parse_neighbours_text(text: str) -> tuple[MeshNeighbour, ...] | None:
+def parse_neighbors_text(text: str) -> tuple[MeshNeighbor, ...] | None:
     """`batctl n`. None when there is not even a header."""
     if "Neighbor" not in text:
         return () if not text.strip() else None
     found = []
     for line in text.splitlines():
-        if row := _NEIGHBOUR_V.match(line):
-            found.append(MeshNeighbour(row[1].lower(), row[4], _milliseconds(row[2], row[3])))
-        elif row := _NEIGHBOUR_IV.match(line):
-            found.append(MeshNeighbour(row[2].lower(), row[1], _milliseconds(row[3], row[4])))
+        if row := _NEIGHBOR_V.match(line):
+            found.append(MeshNeighbor(row[1].lower(), row[4], _milliseconds(row[2], row[3])))
+        elif row := _NEIGHBOR_IV.match(line):
+            found.append(MeshNeighbor(row[2].lower(), row[1], _milliseconds(row[3], row[4])))
     return tuple(found)
 
 

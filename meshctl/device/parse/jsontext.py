@@ -25,7 +25,7 @@ def maps(value: object) -> Iterator[Mapping[str, object]]:
 
 
 def string(value: object) -> str:
-    """A string as it is, a number or truth value as JSON writes it, else empty."""
+    """A string as it is, a number or boolean value as JSON writes it, else empty."""
     if isinstance(value, str):
         return value
     return json.dumps(value) if isinstance(value, bool | int | float) else ""
@@ -47,5 +47,5 @@ def integer(value: object) -> int | None:
     return value if isinstance(value, int) else None
 
 
-def truth(value: object) -> bool:
+def boolean(value: object) -> bool:
     return value is True

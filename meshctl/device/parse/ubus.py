@@ -5,7 +5,7 @@ from __future__ import annotations
 from types import MappingProxyType
 
 from meshctl.device.observation import BoardInfo, NetInterface, RadioState, ReleaseInfo
-from meshctl.device.parse.jsontext import integer, mapping, maps, parse_json, string, strings, truth
+from meshctl.device.parse.jsontext import boolean, integer, mapping, maps, parse_json, string, strings
 
 
 def parse_board(text: str) -> tuple[BoardInfo, ReleaseInfo | None] | None:
@@ -39,10 +39,10 @@ def parse_wireless(text: str) -> tuple[RadioState, ...] | None:
     return tuple(
         RadioState(
             name=name,
-            up=truth(radio.get("up")),
-            pending=truth(radio.get("pending")),
-            disabled=truth(radio.get("disabled")),
-            setup_failed=truth(radio.get("retry_setup_failed")),
+            up=boolean(radio.get("up")),
+            pending=boolean(radio.get("pending")),
+            disabled=boolean(radio.get("disabled")),
+            setup_failed=boolean(radio.get("retry_setup_failed")),
             config=MappingProxyType({key: string(value) for key, value in mapping(radio.get("config")).items()}),
             interfaces=tuple(
                 (string(item.get("section")), string(item.get("ifname"))) for item in maps(radio.get("interfaces"))
@@ -61,8 +61,8 @@ def parse_interfaces(text: str) -> tuple[NetInterface, ...] | None:
     return tuple(
         NetInterface(
             name=string(item.get("interface")),
-            up=truth(item.get("up")),
-            pending=truth(item.get("pending")),
+            up=boolean(item.get("up")),
+            pending=boolean(item.get("pending")),
             device=string(item.get("l3_device")) or string(item.get("device")),
             addresses=tuple(
                 f"{string(address.get('address'))}/{integer(address.get('mask'))}"

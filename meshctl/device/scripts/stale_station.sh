@@ -1,7 +1,7 @@
 # Removes a station entry only if it is stale because the neighbor's radio restarted. Shell functions; the caller
 # appends calls of `flush_stale`, `flush_restarted` or `watch_stale`.
 #
-# A radio that restarts counts its frames from 0, while the holder of an old entry keeps its block acknowledgement window
+# A radio that restarts counts its frames from 0, while the holder of an old entry keeps its block acknowledgment window
 # and drops the neighbor's unicast frames; broadcasts pass. The holder detects that here: it hears the neighbor, but gets
 # no reply to batman-adv echo requests (layer 2, so no firewall matters). Removing the entry of a radio that did not
 # restart causes the same loss in the other direction.

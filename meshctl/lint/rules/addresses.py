@@ -245,7 +245,7 @@ def _out_of_reach(fleet: Fleet, host: str) -> bool:
 
 
 def _within_reach(fleet: Fleet) -> str:
-    """What a reachable host would be."""
+    """A description of reachable hosts."""
     gateways = {str(node.gateway): node.gateway.version for node in fleet.managed() if node.gateway is not None}
     behind = [f"an IPv{version} address, as gateway {gateway}" for gateway, version in gateways.items()]
     return ", or ".join([*behind[:1], "an address of a mesh's network"])

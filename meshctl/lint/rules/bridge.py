@@ -74,7 +74,7 @@ _CHECKED = {
         "zonename": "system.zonename",
     },
 }
-# what a radio without a mesh needs to serve an access point; it has no mesh to take them from
+# options that a radio without a mesh needs to serve an access point, because it has no mesh to take them from
 _ACCESS_POINT_OPTIONS = ("channel", "htmode", "disabled")
 # sections that meshctl renders, besides radios
 _RENDERED = re.compile(r"mesh[0-9]+|bat[0-9]+|lan|backbone|loopback|br_lan|main")

@@ -1,4 +1,4 @@
-"""What a mesh shares with others and how far it reaches: multicast rates, names of cells (MC318 to MC319)."""
+"""Rules about the names of cells and the reach of their multicasts (MC318 to MC319)."""
 
 from __future__ import annotations
 

@@ -38,7 +38,7 @@ def _listed(channels: tuple[int, ...]) -> str:
 
 
 def channel_or_width(channels: tuple[int, ...]) -> str:
-    """What to choose where a channel may not be so wide: one of those that may, if there are any."""
+    """The advice for a channel that may not be so wide: one of the channels that may, if there are any."""
     return f"a channel of {_listed(channels)}" if channels else "a narrower htmode"
 
 

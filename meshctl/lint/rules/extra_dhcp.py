@@ -18,7 +18,7 @@ from meshctl.resolve.intent import LAN
 from meshctl.uci import Package, Section
 from meshctl.wording import join_limited
 
-# what dnsmasq's service uses where an option is missing
+# defaults of dnsmasq's service
 _START, _LIMIT = "100", "150"
 _SERVING = """
     nodes: {base: {extra_uci: {dhcp.lan.ignore: '0', dhcp.lan.start: 'START', dhcp.lan.limit: '50',

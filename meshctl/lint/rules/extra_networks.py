@@ -1,4 +1,4 @@
-"""What extra_uci attaches to the node's networks: interfaces and access points (MC914 to MC917)."""
+"""Rules about interfaces and access points that extra_uci attaches to a node's networks (MC914 to MC917)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from meshctl.model.ip import IpNetwork
 from meshctl.resolve.intent import LAN
 from meshctl.uci import Package, Section
 
-# what libuci's users read as true
+# values that libuci's users read as true
 _TRUE = ("1", "on", "true", "yes", "enabled")
 
 
@@ -48,7 +48,7 @@ def address_server_off(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
 
 
 def missing_for_server(dhcp: Package, section: Section) -> list[str]:
-    """What a range of addresses lacks to be served."""
+    """The options that are missing before a range of addresses is served."""
     missing = []
     if is_on(section, "ignore"):
         missing.append(f'dhcp.{section.name}.ignore: ""')
@@ -115,7 +115,7 @@ def interface_overlaps(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
 
 
 def _networks_of_the_fleet(network: Package, created: dict[str, Section]) -> Iterator[tuple[str, str, IpNetwork]]:
-    """What has it, its device, and the network, of every address and route that the inventory's own keys give."""
+    """Owner, device and network of every address and route that the inventory's own keys give."""
     for section in network.of_type("interface"):
         if section.name is not None and section.name not in created:
             is_bridge = section.get("type") == "bridge"

@@ -13,7 +13,7 @@ from meshctl.model import Fleet, Node
 from meshctl.uci import Package
 from meshctl.wording import join_limited
 
-# of hostapd's encryptions, those with a passphrase that every client knows
+# hostapd's encryptions with a passphrase that every client knows
 _WITH_PASSPHRASE = ("psk", "sae", "wep")
 
 

@@ -87,13 +87,17 @@ def management_shut_out(fleet: Fleet, context: LintContext) -> Iterator[Finding]
             continue
         for file in outcome.files:
             network = LAN if node.lan_address is None else BACKBONE
-            if file.package is not None and file.package.name == "firewall" and not _lets_in(file.package, network):
+            if (
+                file.package is not None
+                and file.package.name == "firewall"
+                and not _accepts_input(file.package, network)
+            ):
                 extra = next((("extra_uci", key) for key in node.extra_uci if key.startswith("firewall.")), ())
                 expected = f"a zone of network {network} with input ACCEPT"
                 yield Finding(("nodes", node.name, *extra), "SSH login would be blocked", expected, "none")
 
 
-def _lets_in(firewall: uci.Package, network: str) -> bool:
+def _accepts_input(firewall: uci.Package, network: str) -> bool:
     for section in firewall.sections:
         is_open = section.get("input").upper() == "ACCEPT"
         if is_open and section.type == "zone" and network in section.get("network").split():

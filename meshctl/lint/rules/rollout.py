@@ -148,7 +148,7 @@ def _radar_detection_s(mesh: Mesh, country: Country) -> int:
 
 
 def _span(mesh: Mesh) -> Span:
-    """What the mesh occupies, or its primary channel where other rules report the width (MC327, MC329)."""
+    """The frequencies that the mesh occupies, or its primary channel if other rules report the width (MC327, MC329)."""
     try:
         occupied = occupied_span(mesh.band, mesh.channel, mesh.htmode)
     except ValueError:

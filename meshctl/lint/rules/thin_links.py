@@ -42,8 +42,8 @@ def number_used_twice(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     "MC772",
     Severity.ERROR,
     "A thin link is not defined",
-    why="""A port for an unknown link is not opened, and a topic for an unknown link is carried by none: the messages
-    that should arrive without wifi do not.""",
+    why="""A port for an unknown link is not opened, and a topic for an unknown link is sent on none: messages
+    that should arrive where Wi-Fi does not reach are lost.""",
     fix="Use a link of `udp_mesh.thin_links`.",
     failing="""
     udp_mesh: {thin_links: {lora: {bits_per_s: 5470, band: eu869}}}
@@ -214,7 +214,7 @@ def frame_beyond_xbee(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     "MC778",
     Severity.WARNING,
     "Only one robot is on a thin link",
-    why="""What it sends there is heard by no one, so without wifi neither its position nor an emergency stop arrives.
+    why="""No other robot hears it there, so beyond Wi-Fi neither its position nor an emergency stop arrives.
     Usually the base station's radio is missing in the inventory.""",
     fix="Add the port of another robot's radio (`thin.ports`), such as the base station's, or remove this one.",
     failing="""

@@ -32,13 +32,13 @@ def gateway_without_uplink(fleet: Fleet, _context: LintContext) -> Iterator[Find
     radios: dict[IpAddress, Node] = {node.address.ip: node for node in fleet.managed()}
     for node in fleet.managed():
         router = radios.get(node.gateway) if node.gateway is not None else None
-        if router is None or router is node or _leads_on(fleet, router):
+        if router is None or router is node or _has_uplink(fleet, router):
             continue
         path = ("nodes", node.name, "gateway")
         yield Finding(path, f"{router.name} has no uplink", "a router, or a radio with an uplink", str(node.gateway))
 
 
-def _leads_on(fleet: Fleet, node: Node) -> bool:
+def _has_uplink(fleet: Fleet, node: Node) -> bool:
     has_interface = any(key.startswith("network.") and value == "interface" for key, value in node.extra_uci.items())
     is_router = node.gateway is not None or node.lan_address is not None
     own_parts = any(fleet.meshes[name].operator_parts.templates for name in node.meshes if name in fleet.meshes)

@@ -55,10 +55,9 @@ def file_sd(fleet: Fleet) -> str:
 def daemon_targets(fleet: Fleet) -> tuple[Mapping[str, str], Sequence[str]]:
     """Robot -> where Prometheus finds the metrics of its daemon; and why robots have no such address, a line each.
 
-    Daemons serve their metrics on loopback alone, so these are addresses of Prometheus' own machine. The base station's
-    computer is taken for that machine. Of another robot's address the first byte is replaced by 127: its daemon's port
-    is to be forwarded there, and adding robots moves no other's target.
-    """
+    Daemons serve their metrics on loopback alone, so these are addresses of Prometheus's own machine. The base
+    station's computer is taken for that machine. Another robot's address gets 127 as its first byte: its daemon's port
+    is to be forwarded there, and adding robots changes no other target."""
     port = fleet.udp_mesh.metrics_port
     if port is None:
         return {}, ()

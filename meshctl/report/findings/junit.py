@@ -16,7 +16,7 @@ from xml.etree import ElementTree
 from meshctl.diagnostics import Diagnostic, Severity
 from meshctl.report.findings.document import Findings
 
-# what XML 1.0 section 2.2 does not allow in a document at all
+# characters that XML 1.0 section 2.2 does not allow in a document
 _FORBIDDEN = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 

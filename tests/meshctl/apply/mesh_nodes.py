@@ -16,5 +16,5 @@ def node(name: str, *hears: str, connected_s: int = 500) -> Observation:
     stations = tuple(Station("mesh0", MACS[other], connected_s=connected_s) for other in hears)
     link = WirelessLink("mesh0", "IBSS", MACS[name])
     return replace(
-        running(fleet(), name, neighbours=()), links=(link,), macs={}, ifindexes={"mesh0": 7}, stations=stations
+        running(fleet(), name, neighbors=()), links=(link,), macs={}, ifindexes={"mesh0": 7}, stations=stations
     )

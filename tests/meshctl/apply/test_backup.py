@@ -144,7 +144,7 @@ def test_a_backup_from_before_a_change_of_the_cell_is_restored_without_its_radio
     assert "/etc/config/network" in without_wireless(backup).files
     # in the backup's cell, or out of reach of any other node
     assert departure(backup, "b01", running(fleet(channel=6), "b01")) == ""
-    assert departure(backup, "b01", replace(seen, neighbours=())) == ""
+    assert departure(backup, "b01", replace(seen, neighbors=())) == ""
 
 
 def test_a_backup_from_before_a_change_of_the_key_is_not_restored() -> None:

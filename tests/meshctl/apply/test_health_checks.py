@@ -13,7 +13,7 @@ from meshctl.device.observation import (
     Bridge,
     ChangeStatus,
     MeshInfo,
-    MeshNeighbour,
+    MeshNeighbor,
     NetInterface,
     Observation,
     Originator,
@@ -33,7 +33,7 @@ def good() -> Observation:
     return running(
         fleet(),
         "b01",
-        neighbours=(BASE, OTHER),
+        neighbors=(BASE, OTHER),
         originators=(Originator(BASE, BASE, "mesh0", 200, True, 250),),
         links=(WirelessLink("mesh0", "IBSS", bssid="02:ca:fe:00:00:01", channel=6, joined=True),),
         interfaces=LAN,
@@ -107,7 +107,7 @@ def test_a_node_that_regained_everything_passes_the_health_check() -> None:
         (replace(good(), macs={"eth0": "02:00:00:00:00:10"}, mesh=None), "bat0 does not exist"),
         (replace(good(), mesh=MeshInfo(hard_interfaces=())), "mesh0 is not part of bat0"),
         (replace(good(), mesh=MeshInfo(hard_interfaces=("mesh1",))), "mesh0 is not part of bat0"),
-        (replace(good(), neighbours=()), "it hears 0 mesh neighbors of the 2 it had"),
+        (replace(good(), neighbors=()), "it hears 0 mesh neighbors of the 2 it had"),
         (replace(good(), originators=()), "it has no route to the base"),
     ],
 )
@@ -116,17 +116,17 @@ def test_each_missing_item_is_named(after: Observation, gap: str) -> None:
 
 
 def test_half_of_the_previous_neighbors_is_enough() -> None:
-    assert gaps(replace(good(), neighbours=(MeshNeighbour("02:00:00:00:00:77", "mesh0", 10),))) == ()
+    assert gaps(replace(good(), neighbors=(MeshNeighbor("02:00:00:00:00:77", "mesh0", 10),))) == ()
 
 
 def test_neighbors_last_heard_before_the_change_do_not_count() -> None:
-    stale = replace(good(), neighbours=(MeshNeighbour(OTHER, "mesh0", 8000), MeshNeighbour(BASE, "mesh0", 8000)))
+    stale = replace(good(), neighbors=(MeshNeighbor(OTHER, "mesh0", 8000), MeshNeighbor(BASE, "mesh0", 8000)))
     assert gaps(stale, since_s=20.0) == ()
     assert gaps(stale, since_s=5.0) == ("it hears 0 mesh neighbors of the 2 it had",)
 
 
 def test_a_node_alone_on_the_bench_needs_no_neighbors() -> None:
-    alone = replace(good(), neighbours=(), originators=())
+    alone = replace(good(), neighbors=(), originators=())
     assert unmet(expectation(wanted(fleet(), "b01"), alone, [BASE]), alone) == ()
 
 
@@ -214,9 +214,9 @@ def with_a_second_interface() -> Observation:
         node,
         uci={**node.uci, "wireless": node.uci["wireless"] + MESH1},
         links=(*(node.links or ()), WirelessLink("mesh1", "IBSS", bssid="02:ca:fe:00:00:01", channel=6, joined=True)),
-        neighbours=(
-            *(node.neighbours or ()),
-            *(MeshNeighbour(f"02:00:00:00:01:{number:02x}", "mesh1", 100) for number in range(5)),
+        neighbors=(
+            *(node.neighbors or ()),
+            *(MeshNeighbor(f"02:00:00:00:01:{number:02x}", "mesh1", 100) for number in range(5)),
         ),
     )
 
@@ -225,7 +225,7 @@ def test_an_interface_that_is_turned_off_must_be_gone() -> None:
     """25.12.5: netifd reports the radio as down, and it continues in its cell."""
     before = with_a_second_interface()
     expected = expectation(wanted(fleet(), "b01"), before, [BASE])
-    after = replace(before, neighbours=good().neighbours)
+    after = replace(before, neighbors=good().neighbors)
     assert unmet(expected, after) == ("mesh1 should be off, but still exists",)
     assert unmet(expected, replace(after, links=good().links)) == ()
 

@@ -77,10 +77,10 @@ def test_each_state_of_the_switch_maps_to_its_next_action(status: ChangeStatus, 
 
 
 def test_an_unverified_change_gets_its_full_window_and_is_then_aborted() -> None:
-    assert move(APPLIED, "no neighbour") is Action.WAIT
-    assert move(replace(APPLIED, left_s=2.0), "no neighbour") is Action.ABORT
-    assert move(replace(APPLIED, reload_status=1), "no neighbour") is Action.ABORT
-    assert move(APPLIED, "no neighbour", leaving=True) is Action.ABORT
+    assert move(APPLIED, "no neighbor") is Action.WAIT
+    assert move(replace(APPLIED, left_s=2.0), "no neighbor") is Action.ABORT
+    assert move(replace(APPLIED, reload_status=1), "no neighbor") is Action.ABORT
+    assert move(APPLIED, "no neighbor", leaving=True) is Action.ABORT
     assert move(APPLIED, new=False) is Action.WAIT
 
 

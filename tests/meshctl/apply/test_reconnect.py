@@ -63,7 +63,7 @@ def test_an_interrupt_need_not_wait_for_neighbors_that_repair_their_links(when: 
     if when == "while it is asked":
         neighbor.run = run  # type: ignore[method-assign]
     heard = Station("mesh0", MAC, inactive_ms=200, connected_s=500)
-    around = {"b01": replace(running(fleet(), "b01", neighbours=()), stations=(heard,))}
+    around = {"b01": replace(running(fleet(), "b01", neighbors=()), stations=(heard,))}
     seen = FleetObservation(around, {"b02": "no answer"})
     pool = cast(ConnectionPool, SimpleNamespace(borrow=borrow))
     reconnect(pool, fleet(), seen, {MAC: "b02"}, interrupt=interrupt, observer=observer)
@@ -84,7 +84,7 @@ def test_a_node_that_does_not_answer_has_its_ssh_server_tried_by_its_neighbors()
         yield SimpleNamespace(run=run)
 
     heard = Station("mesh0", MAC, inactive_ms=200, connected_s=500)
-    around = {"b01": replace(running(fleet(), "b01", neighbours=()), stations=(heard,))}
+    around = {"b01": replace(running(fleet(), "b01", neighbors=()), stations=(heard,))}
     pool = cast(ConnectionPool, SimpleNamespace(borrow=borrow))
     seen = FleetObservation(around, {"b02": "no answer"})
     assert reconnect(pool, fleet(), seen, {MAC: "b02"}, interrupt=Interrupt()).nodes == {"b02"}

@@ -97,7 +97,7 @@ def test_only_holders_of_entries_of_the_restarting_radio_are_queried() -> None:
 
 
 def hears(*macs: str) -> Observation:
-    return replace(itself(MAC), neighbours=(), stations=tuple(Station("mesh0", mac) for mac in macs))
+    return replace(itself(MAC), neighbors=(), stations=tuple(Station("mesh0", mac) for mac in macs))
 
 
 def test_unobserved_neighbors_may_hold_an_entry() -> None:

@@ -23,7 +23,7 @@ from tests.meshctl.apply.mesh_nodes import MAC, MACS, node
 from tests.meshctl.plan.support import fleet
 
 
-class Neighbours:
+class Neighbors:
     """A fleet whose neighbors answer or do not: the queries, and the notes for the operator."""
 
     def __init__(self, around: dict[str, Observation], *, silent: tuple[str, ...] = (), answer: str = f"gone {MAC}\n"):
@@ -86,7 +86,7 @@ def watching(scripts: list[str], exit_status: int = 0) -> SshConnection:
 def test_repeated_queries_are_journaled_and_reported_once(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    near = Neighbours({"b02": node("b02"), "b01": node("b01", "b02")})
+    near = Neighbors({"b02": node("b02"), "b01": node("b01", "b02")})
     monkeypatch.setattr("meshctl.apply.station_flush.next_query_s", lambda asked_s: float("-inf"))
     flush = near.flushes.listener(near.job, EVERY_RADIO)
     flush.started()
@@ -106,7 +106,7 @@ def test_a_node_that_stays_unreachable_may_have_lost_its_power_whatever_its_chan
     the node's unicast for minutes, so that it stayed unreachable although it was back in its mesh."""
     now_s = [1000.0]
     monkeypatch.setattr("meshctl.apply.station_flush.time", SimpleNamespace(monotonic=lambda: now_s[0]))
-    near = Neighbours({"b02": node("b02"), "b01": node("b01", "b02")})
+    near = Neighbors({"b02": node("b02"), "b01": node("b01", "b02")})
     flush = near.flushes.listener(near.job, radios)
     flush.started()
     now_s[0] += 15
@@ -127,7 +127,7 @@ def test_neighbors_that_the_plan_did_not_observe_are_queried_for_a_node_that_may
     """Seen on real OpenWrt: a change of one node's host name, whose plan observed that node alone, and a power cut."""
     now_s = [1000.0]
     monkeypatch.setattr("meshctl.apply.station_flush.time", SimpleNamespace(monotonic=lambda: now_s[0]))
-    near = Neighbours({"b02": node("b02", "b01")})
+    near = Neighbors({"b02": node("b02", "b01")})
     flush = near.flushes.listener(near.job, NO_RADIOS)
     flush.started()
     now_s[0] += 15
@@ -159,7 +159,7 @@ def test_a_node_that_is_unreachable_although_it_must_answer_logins_is_logged_in_
     interfaces = (NetInterface("lan", up=True, pending=False, addresses=(f"{had}/24",)),)
     before = replace(node("b02"), interfaces=interfaces)
     before = replace(before, macs={**(before.macs or {}), "bat0": "76:9f:08:ba:c9:d5"})
-    near = Neighbours({"b02": before, "b01": node("b01", "b02")})
+    near = Neighbors({"b02": before, "b01": node("b01", "b02")})
     flush = near.flushes.listener(near.job, radios)
     flush.started()
     now_s[0] += 100
@@ -184,7 +184,7 @@ def test_neighbors_log_in_to_a_node_that_would_notice_if_they_removed_an_entry_b
 ) -> None:
     """A change of the network may drop logins, and so may a stale entry that passes echo replies."""
     interfaces = (NetInterface("lan", up=True, pending=False, addresses=("10.42.0.102/24",)),)
-    near = Neighbours({"b02": replace(node("b02", "b01"), interfaces=interfaces), "b01": node("b01", "b02")})
+    near = Neighbors({"b02": replace(node("b02", "b01"), interfaces=interfaces), "b01": node("b01", "b02")})
     flush = near.flushes.listener(near.job, EVERY_RADIO)
     flush.armed(watching([], exit_status), for_s=100.0)
     flush.started()
@@ -194,7 +194,7 @@ def test_neighbors_log_in_to_a_node_that_would_notice_if_they_removed_an_entry_b
 
 
 def test_without_restarting_radios_neighbors_are_queried_only_after_a_reboot() -> None:
-    near = Neighbours({"b02": node("b02"), "b01": node("b01", "b02")})
+    near = Neighbors({"b02": node("b02"), "b01": node("b01", "b02")})
     flush = near.flushes.listener(near.job, NO_RADIOS)
     flush.started()
     flush.unreachable()
@@ -213,7 +213,7 @@ def test_a_node_that_loses_its_power_before_its_change_starts_has_its_neighbors_
     interfaces = (NetInterface("lan", up=True, pending=False, addresses=("10.42.0.102/24",)),)
     before = replace(node("b02"), interfaces=interfaces)
     before = replace(before, macs={**(before.macs or {}), "bat0": "76:9f:08:ba:c9:d5"})
-    near = Neighbours({"b02": before, "b01": node("b01", "b02")})
+    near = Neighbors({"b02": before, "b01": node("b01", "b02")})
     flush = near.flushes.listener(near.job, NO_RADIOS)
     now_s[0] += 30
     flush.unreachable(is_login_due=True)
@@ -227,7 +227,7 @@ def test_an_armed_change_starts_watches_on_the_node_and_on_those_reached_through
     base = "02:00:00:00:01:00"
     route = Originator(base, MAC, "mesh0", last_seen_ms=100, best=True)
     around = {"b02": node("b02", "b01", "b03"), "b01": node("b01", "b02"), "b03": node("b03", "b02")}
-    near = Neighbours({**around, "b03": replace(around["b03"], originators=(route,))}, answer="watching\n")
+    near = Neighbors({**around, "b03": replace(around["b03"], originators=(route,))}, answer="watching\n")
     near.work.current_base_macs = lambda node: frozenset({base})  # type: ignore[method-assign]
     own: list[str] = []
     connection = watching(own)
@@ -247,7 +247,7 @@ def test_an_armed_change_starts_watches_on_the_node_and_on_those_reached_through
 def test_a_node_watches_its_entries_of_nodes_that_restart_at_the_same_moment() -> None:
     """Its part may be called off before its radio restarts. Seen in the lab: after two Ctrl-C in a change of the
     channel, half of the mesh did not hear the other half's unicast for ten minutes."""
-    near = Neighbours({"b02": node("b02", "b01"), "b01": node("b01", "b02")})
+    near = Neighbors({"b02": node("b02", "b01"), "b01": node("b01", "b02")})
     own: list[str] = []
     flush = near.flushes.listener(near.job, EVERY_RADIO)
     flush.restarting(["b01", "b02"])
@@ -257,7 +257,7 @@ def test_a_node_watches_its_entries_of_nodes_that_restart_at_the_same_moment() -
 
 def test_a_node_that_went_back_has_the_nodes_queried_that_restarted_with_it() -> None:
     """They know its radio from between its two restarts."""
-    near = Neighbours({"b02": node("b02", "b01"), "b01": node("b01", "b02")})
+    near = Neighbors({"b02": node("b02", "b01"), "b01": node("b01", "b02")})
     flush = near.flushes.listener(near.job, EVERY_RADIO)
     flush.restarting(["b01", "b02"])
     flush.started()
@@ -268,7 +268,7 @@ def test_a_node_that_went_back_has_the_nodes_queried_that_restarted_with_it() ->
 
 
 def test_unobserved_neighbors_are_queried_when_the_node_is_back() -> None:
-    near = Neighbours({"b02": node("b02", "b01", "b03"), "b01": node("b01", "b02")}, silent=("b03",))
+    near = Neighbors({"b02": node("b02", "b01", "b03"), "b01": node("b01", "b02")}, silent=("b03",))
     flush = near.flushes.listener(near.job, EVERY_RADIO)
     flush.started()
     flush.unreachable()
@@ -282,9 +282,7 @@ def test_unobserved_neighbors_are_queried_when_the_node_is_back() -> None:
 
 
 def test_unanswered_queries_are_retried_at_the_end_and_the_rest_is_reported() -> None:
-    near = Neighbours(
-        {"b02": node("b02", "b01", "b03", "b04"), "b01": node("b01", "b02")}, silent=("b01", "b03", "b04")
-    )
+    near = Neighbors({"b02": node("b02", "b01", "b03", "b04"), "b01": node("b01", "b02")}, silent=("b01", "b03", "b04"))
     flush = near.flushes.listener(near.job, EVERY_RADIO)
     flush.started()
     flush.ended(node("b02"))
@@ -301,7 +299,7 @@ def test_unanswered_queries_are_retried_at_the_end_and_the_rest_is_reported() ->
 
 
 def test_login_time_counts_toward_the_age_threshold_of_an_entry(monkeypatch: pytest.MonkeyPatch) -> None:
-    near = Neighbours({"b02": node("b02"), "b01": node("b01", "b02")})
+    near = Neighbors({"b02": node("b02"), "b01": node("b01", "b02")})
     now_s = [1000.0]
     monkeypatch.setattr("meshctl.apply.station_flush.time", SimpleNamespace(monotonic=lambda: now_s[0]))
     flush = near.flushes.listener(near.job, EVERY_RADIO)
@@ -313,7 +311,7 @@ def test_login_time_counts_toward_the_age_threshold_of_an_entry(monkeypatch: pyt
 
 
 def test_a_neighbor_that_cannot_remove_its_entry_is_reported() -> None:
-    near = Neighbours({"b02": node("b02"), "b01": node("b01", "b02")}, answer=f"kept {MAC}\n")
+    near = Neighbors({"b02": node("b02"), "b01": node("b01", "b02")}, answer=f"kept {MAC}\n")
     flush = near.flushes.listener(near.job, EVERY_RADIO)
     flush.started()
     flush.ended(node("b02"))
@@ -322,7 +320,7 @@ def test_a_neighbor_that_cannot_remove_its_entry_is_reported() -> None:
 
 def test_an_unverifiable_entry_is_removed_only_for_an_observed_restart() -> None:
     for index, has_restarted in ((7, False), (8, True)):
-        near = Neighbours({"b02": node("b02"), "b01": node("b01", "b02")}, answer=f"unknown {MAC}\n")
+        near = Neighbors({"b02": node("b02"), "b01": node("b01", "b02")}, answer=f"unknown {MAC}\n")
         flush = near.flushes.listener(near.job, EVERY_RADIO)
         flush.started()
         flush.ended(replace(node("b02", "b01"), ifindexes={"mesh0": index}))
@@ -330,10 +328,10 @@ def test_an_unverifiable_entry_is_removed_only_for_an_observed_restart() -> None
 
 
 def test_a_change_without_an_observed_end_is_flushed_later_if_the_radio_has_restarted() -> None:
-    same = Neighbours({"b02": node("b02", "b01", connected_s=500)})
+    same = Neighbors({"b02": node("b02", "b01", connected_s=500)})
     same.flushes.flush_later(same.job, ago_s=100.0)
     assert same.asked == []
-    again = Neighbours({"b02": node("b02", "b01", connected_s=50)})
+    again = Neighbors({"b02": node("b02", "b01", connected_s=50)})
     again.flushes.flush_later(again.job, ago_s=100.0)
     assert again.names == ["b01"]
     assert re.search(r"flush_stale .* 10[01]\n", again.asked[0][1])
@@ -344,7 +342,7 @@ def test_entries_from_before_a_boot_are_flushed_later(
 ) -> None:
     monkeypatch.setattr("meshctl.apply.station_flush.time", SimpleNamespace(monotonic=lambda: 0.0, time=lambda: 1003.0))
     seen = replace(node("b02", "b01"), asked_at_s=1000.0, uptime_s=40.0)
-    booted = Neighbours({"b02": seen})
+    booted = Neighbors({"b02": seen})
     booted.flushes.flush_later(booted.job, ago_s=500.0)
     assert re.search(r"flush_stale .* 43\n", booted.asked[0][1])
 

@@ -17,10 +17,15 @@ from tests.meshctl.inventory.inventories import HEAD
 @pytest.mark.parametrize(
     ("of", "asked_by", "error", "hint"),
     [
-        (("f", ""), ("f", "/lab"), "one of the real fleet, and $MESHCTL_LAB or --lab names the lab in /lab", "unset"),
-        (("f", "/lab"), ("f", ""), "one of the lab in /lab", "add `--lab /lab`"),
-        (("f", "/lab"), ("f", "/other"), "one of the lab in /lab", "add `--lab /lab`"),
-        (("g", ""), ("f", ""), "one of fleet g: expected one of fleet f", ""),
+        (
+            ("f", ""),
+            ("f", "/lab"),
+            "belongs to the real fleet, but $MESHCTL_LAB or --lab selects the lab in /lab",
+            "unset",
+        ),
+        (("f", "/lab"), ("f", ""), "belongs to the lab in /lab", "add `--lab /lab`"),
+        (("f", "/lab"), ("f", "/other"), "belongs to the lab in /lab", "add `--lab /lab`"),
+        (("g", ""), ("f", ""), "belongs to fleet g, not to f", ""),
     ],
 )
 def test_a_run_of_another_fleet_is_refused_by_its_fleet(

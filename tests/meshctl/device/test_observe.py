@@ -73,8 +73,8 @@ def test_the_facts_a_plan_needs_are_there_for_every_release(release: str) -> Non
     assert seen.board.lan_ports
     assert seen.mesh is not None
     assert seen.mesh.hard_interfaces == ("mesh0",)
-    assert seen.neighbours is not None
-    assert {neighbour.ifname for neighbour in seen.neighbours} == {"mesh0"}
+    assert seen.neighbors is not None
+    assert {neighbor.ifname for neighbor in seen.neighbors} == {"mesh0"}
     assert seen.originators is not None
     assert [path.best for path in seen.originators].count(True) == 3
     assert seen.links is not None
@@ -134,10 +134,10 @@ PARSERS = [
     batctl.parse_mesh_json,
     batctl.parse_mesh_header,
     batctl.parse_interfaces_text,
-    batctl.parse_neighbours_text,
+    batctl.parse_neighbors_text,
     batctl.parse_originators_text,
     lambda text: batctl.parse_hardifs_json(text, {}),
-    lambda text: batctl.parse_neighbours_json(text, {}),
+    lambda text: batctl.parse_neighbors_json(text, {}),
     lambda text: batctl.parse_originators_json(text, {}),
     packages.parse_packages,
     packages.parse_package_tool,
@@ -418,8 +418,8 @@ def test_batman_v_tables_give_throughput() -> None:
         "         Neighbor   last-seen      speed           IF\n"
         "02:00:00:00:00:02    0.460s (       10.4) [     mesh0]\n"
     )
-    (neighbour,) = batctl.parse_neighbours_text(near) or ()
-    assert (neighbour.mac, neighbour.ifname, neighbour.last_seen_ms) == ("02:00:00:00:00:02", "mesh0", 460)
+    (neighbor,) = batctl.parse_neighbors_text(near) or ()
+    assert (neighbor.mac, neighbor.ifname, neighbor.last_seen_ms) == ("02:00:00:00:00:02", "mesh0", 460)
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 
 from meshctl.cli import history_follow
-from meshctl.cli.history_follow import happenings
+from meshctl.cli.history_follow import run_events
 from meshctl.fleet import Outcome, Result
 from tests.meshctl.fleet.laptops import Laptop
 from tests.meshctl.fleet.postgresql_server import Uplink
@@ -20,7 +20,7 @@ def test_following_shows_what_other_operators_do(alice: Laptop, bob: Laptop) -> 
     with alice.open() as hers, bob.open() as his:
         old = hers.begin("provision", fleet="f", inventory="i", nodes=("x",))
         seen: list[str] = []
-        following = happenings(his, lambda run: True, None)
+        following = run_events(his, lambda run: True, None)
         seen.append(str(next(following)))
         run = hers.begin("provision", fleet="f", inventory="i", nodes=("a", "b"))
         seen.append(str(next(following)))
@@ -43,11 +43,11 @@ def test_following_shows_what_other_operators_do(alice: Laptop, bob: Laptop) -> 
 def test_following_waits_for_a_lost_database_and_then_shows_what_was_missed(
     alice: Laptop, carol: Laptop, uplink: Uplink, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(history_follow, "LOOK_S", 0.05)
+    monkeypatch.setattr(history_follow, "POLL_S", 0.05)
     notices: list[str] = []
     with alice.open() as hers, carol.open() as cut_off:
         old = hers.begin("provision", fleet="f", inventory="i", nodes=("x",))
-        following = happenings(cut_off, lambda run: True, None, notify=notices.append)
+        following = run_events(cut_off, lambda run: True, None, notify=notices.append)
         assert next(following).run.id == old.id
         uplink.cut()
         run = hers.begin("provision", fleet="f", inventory="i", nodes=("a",))

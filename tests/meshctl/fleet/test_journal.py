@@ -15,7 +15,7 @@ from meshctl.errors import MeshctlError, NodeError
 from meshctl.fleet import Outcome, Result
 from meshctl.fleet.journal import Journal, default_path
 from meshctl.fleet.journal_schema import SCHEMA
-from meshctl.fleet.process import process_lives, this_process
+from meshctl.fleet.process import is_process_alive, this_process
 from meshctl.fleet.sqlite_file import SqliteFile
 
 
@@ -33,7 +33,7 @@ def test_every_node_of_a_run_is_pending_until_it_has_an_outcome(path: Path) -> N
     with Journal(path) as journal:
         run = journal.begin("provision", fleet="f", inventory="inv", nodes=("a", "b", "c"))
         run.finish_node(Outcome("b", Result.DONE, facts={"revision": "r1"}))
-        run.finish_node(Outcome("c", Result.ROLLED_BACK, "no neighbour"))
+        run.finish_node(Outcome("c", Result.ROLLED_BACK, "no neighbor"))
         assert [outcome.result for outcome in journal.outcomes(run.id)] == [
             Result.PENDING,
             Result.DONE,
@@ -164,9 +164,9 @@ def test_the_journal_is_located_in_the_xdg_state_directory() -> None:
 
 def test_a_reused_pid_is_not_mistaken_for_the_original_process() -> None:
     own = this_process()
-    assert process_lives(own)
-    assert not process_lives(own + "1")
-    assert process_lives("elsewhere:1:1")
+    assert is_process_alive(own)
+    assert not is_process_alive(own + "1")
+    assert is_process_alive("elsewhere:1:1")
 
 
 def test_an_unwritable_journal_is_reported_without_stopping_the_run(path: Path) -> None:

@@ -12,7 +12,7 @@ from rich.console import Console
 from meshctl.fleet import Event, EventKind, Outcome, Result
 from meshctl.report.progress import JsonProgress, LiveProgress, PlainProgress, ThreadedProgress
 
-GONE = Outcome("b01", Result.ROLLED_BACK, "no neighbour came back", hint="look at its antenna", duration_s=12.34)
+GONE = Outcome("b01", Result.ROLLED_BACK, "no neighbor came back", hint="look at its antenna", duration_s=12.34)
 EVENTS = [
     Event(EventKind.STARTED, "b01", 1.0),
     Event(EventKind.STEP, "b01", 1.1, "stage"),
@@ -30,7 +30,7 @@ def test_plain_lines_show_steps_notes_and_outcomes() -> None:
     assert out.getvalue().splitlines() == [
         "b01: stage",
         "3 nodes change simultaneously",
-        "b01: rolled back: no neighbour came back (12.3 s)",
+        "b01: rolled back: no neighbor came back (12.3 s)",
         "  hint: look at its antenna",
     ]
 
@@ -53,7 +53,7 @@ def test_live_lines_keep_outcomes_and_count_them() -> None:
             progress(event)
     assert isinstance(console.file, io.StringIO)
     shown = console.file.getvalue()
-    assert "b01: rolled back: no neighbour came back (12.3 s)" in shown
+    assert "b01: rolled back: no neighbor came back (12.3 s)" in shown
     assert "1/2 nodes: 1 rolled back" in shown
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from meshctl.device.observation import MeshNeighbour, Observation, Originator, Station
+from meshctl.device.observation import MeshNeighbor, Observation, Originator, Station
 from meshctl.fleet.journal import LastKnown
 from meshctl.nodes.last_seen import LastSeen, last_seen_of
 from tests.meshctl.plan.support import fleet, running
@@ -20,8 +20,8 @@ NOW_S = 10_095.0
 
 
 def hears(name: str, age_ms: int, **changes: Any) -> Observation:
-    seen = running(fleet(), name, neighbours=())
-    return replace(seen, neighbours=(MeshNeighbour(LOST.upper(), "mesh0", age_ms),), **changes)
+    seen = running(fleet(), name, neighbors=())
+    return replace(seen, neighbors=(MeshNeighbor(LOST.upper(), "mesh0", age_ms),), **changes)
 
 
 def of(**observations: Observation) -> LastSeen:

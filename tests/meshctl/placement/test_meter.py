@@ -18,7 +18,7 @@ from meshctl.placement.margin import (
     slope_db_per_m,
     worse_snr_db,
 )
-from meshctl.placement.meter import Advice, LinkLook, Look, Meter, PathBeyond, Reading
+from meshctl.placement.meter import Advice, LinkSnapshot, Meter, PathBeyond, Reading, RelayLink
 from meshctl.placement.reading import is_due_to_speak, large, line, page, reading_json, words
 
 NEEDED_DB = 7.0
@@ -46,10 +46,10 @@ def drive(
     found = []
     for index, depth_m in enumerate(range(from_m, to_m + step, step)):
         heard = {"base": signal_dbm(depth_m), **others(depth_m)}
-        links = tuple(LinkLook(name, dbm, NOISE_DBM) for name, dbm in heard.items() if dbm is not None)
+        links = tuple(RelayLink(name, dbm, NOISE_DBM) for name, dbm in heard.items() if dbm is not None)
         found.append(
             meter.step(
-                Look(
+                LinkSnapshot(
                     start_s + index,
                     links,
                     paths or {"base": PathBeyond(0), **{name: PathBeyond(0) for name in others(depth_m)}},
@@ -143,9 +143,9 @@ def test_another_relay_with_a_good_margin_vetoes_a_drop() -> None:
     lonely = Meter(NEEDED_DB)
     steps = [
         lonely.step(
-            Look(
+            LinkSnapshot(
                 float(depth_m),
-                (LinkLook("base", falling(depth_m), NOISE_DBM), LinkLook("b07", -60.0, NOISE_DBM)),
+                (RelayLink("base", falling(depth_m), NOISE_DBM), RelayLink("b07", -60.0, NOISE_DBM)),
                 # b07 does not reach the base
                 {"base": PathBeyond(0)},
                 (float(depth_m), 0.0, 0.0),
@@ -219,7 +219,7 @@ def test_a_weak_hop_behind_the_relay_is_named() -> None:
 
 
 def test_before_the_first_link_nothing_is_claimed() -> None:
-    reading = Meter(NEEDED_DB).step(Look(0.0, (), {}))
+    reading = Meter(NEEDED_DB).step(LinkSnapshot(0.0, (), {}))
     assert reading.advice is Advice.TURN_BACK
     assert reading.reason == "no relay that reaches the base has been heard yet"
     fields = reading_json("spot1", reading)
@@ -232,8 +232,12 @@ def test_before_the_first_link_nothing_is_claimed() -> None:
 def test_the_stock_of_beacons_carries_as_many_spacings() -> None:
     meter = Meter(NEEDED_DB)
     for depth_m in range(30):
-        look = Look(float(depth_m), (LinkLook("base", falling(depth_m)),), {"base": PathBeyond(0)}, (depth_m, 0.0, 0.0))
-        reading = meter.step(Look(look.now_s, look.links, look.paths, look.position, beacons=3, spacing_m=40.0))
+        snapshot = LinkSnapshot(
+            float(depth_m), (RelayLink("base", falling(depth_m)),), {"base": PathBeyond(0)}, (depth_m, 0.0, 0.0)
+        )
+        reading = meter.step(
+            LinkSnapshot(snapshot.now_s, snapshot.links, snapshot.paths, snapshot.position, beacons=3, spacing_m=40.0)
+        )
     assert reading.meters_left is not None
     assert reading.depth_left_m == pytest.approx(reading.meters_left + 120.0)
 

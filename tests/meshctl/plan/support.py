@@ -10,7 +10,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from meshctl.device.observation import BoardInfo, ChangeStatus, FileInfo, MeshNeighbour, Observation, ReleaseInfo
+from meshctl.device.observation import BoardInfo, ChangeStatus, FileInfo, MeshNeighbor, Observation, ReleaseInfo
 from meshctl.inventory import load_fleet
 from meshctl.model import Fleet, Node, Secret, SecretRef
 from meshctl.plan import DesiredState, NodePlan, node_plan
@@ -107,7 +107,7 @@ def wanted(team: Fleet, name: str) -> DesiredState:
 
 
 def running(
-    team: Fleet, name: str, *, neighbours: Iterable[str] = ("02:00:00:00:01:00",), **changes: Any
+    team: Fleet, name: str, *, neighbors: Iterable[str] = ("02:00:00:00:01:00",), **changes: Any
 ) -> Observation:
     """An observation of a node that runs exactly what `team` wants of it; `changes` replace fields."""
     want = wanted(team, name)
@@ -128,7 +128,7 @@ def running(
         boot_id="boot",
         uptime_s=500.0,
         macs={"eth0": "02:00:00:00:00:10"},
-        neighbours=tuple(MeshNeighbour(mac, "mesh0", 100) for mac in neighbours),
+        neighbors=tuple(MeshNeighbor(mac, "mesh0", 100) for mac in neighbors),
         packages={"hostapd-common": "1"} | {name: "1" for group in want.needs.any_of for name in group},
         uci=uci,
         uci_changes=(),
@@ -145,7 +145,7 @@ def factory(team: Fleet, name: str) -> Observation:
         "network": "config interface 'lan'\n\toption proto 'static'\n\toption ipaddr '192.168.1.1'\n",
         "system": "config system\n\toption hostname 'OpenWrt'\n",
     }
-    return running(team, name, neighbours=(), uci=stock, files={})
+    return running(team, name, neighbors=(), uci=stock, files={})
 
 
 def planned(team: Fleet, name: str, seen: Observation | None, **options: Any) -> NodePlan:

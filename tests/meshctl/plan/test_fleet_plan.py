@@ -124,7 +124,7 @@ def test_refused_members_in_the_old_cell_block_a_switch() -> None:
 
 def test_a_base_without_neighbors_cannot_leave_its_mesh_unacknowledged() -> None:
     new = fleet(channel=11)
-    seen = {name: running(fleet(), name, neighbours=()) if name == "base" else None for name in TEAM}
+    seen = {name: running(fleet(), name, neighbors=()) if name == "base" else None for name in TEAM}
     assert "would leave behind b01" in fleet_plan(new, plans(new, seen), STAR, now_s=0.0).refusal
 
 
@@ -166,7 +166,7 @@ def test_formerly_meshed_nodes_without_neighbors_get_a_canary() -> None:
     new = fleet(canary=True, max_down=2)
     seen = {}
     for name in TEAM[:3]:
-        observation = running(fleet(), name, neighbours=())
+        observation = running(fleet(), name, neighbors=())
         assert observation.uci is not None
         seen[name] = replace(observation, uci={**observation.uci, "dhcp": ""})
     plan = fleet_plan(new, plans(new, seen), graph(), now_s=0.0)

@@ -16,7 +16,7 @@ from meshctl.device.observation import (
     LanFilterCounts,
     Load,
     Memory,
-    MeshNeighbour,
+    MeshNeighbor,
     RadioState,
     Space,
     WirelessLink,
@@ -151,7 +151,7 @@ def test_a_cut_vertex_is_reported_without_degrading_the_node(fleet: Fleet) -> No
         ({"links": (WirelessLink("mesh0", "IBSS", MACS["rover"], joined=False),)}, "join"),
         ({"links": (WirelessLink("mesh0", "IBSS", MACS["rover"], channel=11, joined=True),)}, "channel"),
         ({"bridges": (Bridge("br-lan", ("bat0",)),)}, "bridge"),
-        ({"neighbours": (), "originators": (), "stations": ()}, "alone"),
+        ({"neighbors": (), "originators": (), "stations": ()}, "alone"),
     ],
 )
 def test_a_node_problem_degrades_the_node(fleet: Fleet, change: dict[str, Any], code: str) -> None:
@@ -240,8 +240,8 @@ def test_a_lan_filter_that_is_not_loaded_is_reported_if_the_files_are_right(flee
 
 
 def test_a_stranger_in_the_mesh_is_reported(fleet: Fleet) -> None:
-    stranger = MeshNeighbour("66:66:66:66:66:66", "mesh0", 50)
-    base = replace(HEALTHY["base"], neighbours=(*(HEALTHY["base"].neighbours or ()), stranger))
+    stranger = MeshNeighbor("66:66:66:66:66:66", "mesh0", 50)
+    base = replace(HEALTHY["base"], neighbors=(*(HEALTHY["base"].neighbors or ()), stranger))
     status = status_of(fleet, {**HEALTHY, "base": base})
     assert status.strangers == ("66:66:66:66:66:66",)
     assert status.exit_code is ExitCode.FINDINGS

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from meshctl.device.observation import MeshNeighbour, Observation, Originator, Station, WirelessLink
+from meshctl.device.observation import MeshNeighbor, Observation, Originator, Station, WirelessLink
 from meshctl.inventory import load_fleet
 from meshctl.model import Fleet, Secret
 from meshctl.resolve import resolve
@@ -73,7 +73,7 @@ def _relay(name: str, back: Mapping[str, int], main: Mapping[str, int]) -> Obser
             WirelessLink("mesh1", "IBSS", MACS[name], "trio", channel=6, joined=True),
         ),
         stations=tuple(Station(ifname, mac, signal_dbm=-60) for ifname, mac, _ in both),
-        neighbours=tuple(MeshNeighbour(mac, ifname, 100) for ifname, mac, _ in both),
+        neighbors=tuple(MeshNeighbor(mac, ifname, 100) for ifname, mac, _ in both),
         originators=tuple(Originator(mac, mac, ifname, 100, True, tq=tq) for ifname, mac, tq in both),
     )
 

@@ -62,7 +62,7 @@ def test_a_path_is_one_hop_longer_than_the_path_of_its_next_hop(graph: Graph) ->
         if name == "n0":
             assert (path.hops, path.quality) == (0, 1.0)
             continue
-        link = graph.neighbours[name][path.via]
+        link = graph.neighbors[name][path.via]
         assert path.hops == paths[path.via].hops + 1
         assert path.quality == pytest.approx(paths[path.via].quality * link.quality)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from meshctl.topology import HeardNeighbor, Link, Report, Sighting, neighbours_of, observed_graph, seen_by
+from meshctl.topology import HeardNeighbor, Link, Report, Sighting, heard_by_name, observed_graph, seen_by
 
 BASE = Report("base", ("02:00:00:00:00:01",), (HeardNeighbor("02:00:00:00:00:02", 100, 0.9),))
 B01 = Report(
@@ -14,12 +14,12 @@ B01 = Report(
 
 def test_a_link_has_the_worse_quality_of_its_two_directions() -> None:
     graph = observed_graph([BASE, B01])
-    assert graph.neighbours["base"]["b01"].quality == graph.neighbours["b01"]["base"].quality == 0.7
+    assert graph.neighbors["base"]["b01"].quality == graph.neighbors["b01"]["base"].quality == 0.7
 
 
 def test_an_unresponsive_node_is_identified_in_the_graph_by_its_known_mac() -> None:
     graph = observed_graph([BASE, B01], known_macs={"02:00:00:00:00:03": "b02"})
-    assert graph.neighbours["b02"]["b01"].quality == 0.5
+    assert graph.neighbors["b02"]["b01"].quality == 0.5
 
 
 def test_an_unknown_node_is_listed_by_its_mac() -> None:
@@ -44,8 +44,8 @@ def test_the_best_measured_radio_of_a_neighbor_is_used() -> None:
     names = {"02:00:00:00:00:01": "husky", "02:00:00:00:00:02": "husky", "02:00:00:00:00:03": "husky"}
     front, rear = HeardNeighbor("02:00:00:00:00:01", 100, 0.4, -60), HeardNeighbor("02:00:00:00:00:02", 900, 0.8, -75)
     unmeasured = HeardNeighbor("02:00:00:00:00:03", 10, None, -40)
-    assert neighbours_of(Report("base", (), (front, rear, unmeasured)), names) == {"husky": rear}
-    assert neighbours_of(Report("base", (), (unmeasured, front)), names) == {"husky": front}
+    assert heard_by_name(Report("base", (), (front, rear, unmeasured)), names) == {"husky": rear}
+    assert heard_by_name(Report("base", (), (unmeasured, front)), names) == {"husky": front}
 
 
 def test_a_second_radio_has_the_quality_of_the_path_that_ends_there() -> None:
@@ -53,19 +53,19 @@ def test_a_second_radio_has_the_quality_of_the_path_that_ends_there() -> None:
     names = {"02:00:00:00:00:01": "relay", "02:00:00:00:00:02": "relay", "02:00:00:00:00:03": "base"}
     paths = {"02:00:00:00:00:01": 0.6, "02:00:00:00:00:03": 0.5}
     end = Report("end", (), (HeardNeighbor("02:00:00:00:00:02", 10, paths=paths),))
-    assert neighbours_of(end, names)["relay"].quality == 0.6
+    assert heard_by_name(end, names)["relay"].quality == 0.6
     graph = observed_graph([end], known_macs=names)
-    assert graph.neighbours["end"]["relay"].quality == 0.6
+    assert graph.neighbors["end"]["relay"].quality == 0.6
 
 
 def test_without_quality_the_strongest_signal_wins_then_the_latest_sighting() -> None:
     names = {"02:00:00:00:00:01": "husky", "02:00:00:00:00:02": "husky"}
     weak, strong = HeardNeighbor("02:00:00:00:00:01", 10, None, -80), HeardNeighbor("02:00:00:00:00:02", 900, None, -60)
-    assert neighbours_of(Report("base", (), (weak, strong)), names) == {"husky": strong}
+    assert heard_by_name(Report("base", (), (weak, strong)), names) == {"husky": strong}
     early, late = HeardNeighbor("02:00:00:00:00:01", 900), HeardNeighbor("02:00:00:00:00:02", 10)
-    assert neighbours_of(Report("base", (), (early, late)), names) == {"husky": late}
+    assert heard_by_name(Report("base", (), (early, late)), names) == {"husky": late}
 
 
 def test_a_node_is_not_its_own_neighbor() -> None:
     own = Report("husky", ("02:00:00:00:00:01",), (HeardNeighbor("02:00:00:00:00:02", 10, 0.9),))
-    assert neighbours_of(own, {"02:00:00:00:00:02": "husky"}) == {}
+    assert heard_by_name(own, {"02:00:00:00:00:02": "husky"}) == {}

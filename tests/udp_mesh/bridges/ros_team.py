@@ -17,7 +17,7 @@ from tests.udp_mesh.bridges.ros1_processes import Master, Ros1Bridge, Ros1Node
 from tests.udp_mesh.daemon.processes import KEY, PATIENT_RATES, RunningDaemon, poll, wait_online
 
 LOSSY = Link(rate=20e6, delay_ms=5.0, loss=0.05)
-"""Loss in both directions, acknowledgements included."""
+"""Loss in both directions, acknowledgments included."""
 
 TOPICS = """
 [topics]

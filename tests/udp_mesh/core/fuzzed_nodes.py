@@ -17,7 +17,7 @@ from udp_mesh.core.logs.messages import Have, HaveEntry, Holder, ItemRequest, en
 from udp_mesh.core.logs.serving import MAX_QUEUED
 from udp_mesh.core.receiver.datagram_age import clock_ms
 from udp_mesh.core.relaying.hop_queue import MAX_HOP_BYTES
-from udp_mesh.core.relaying.relaying import MAX_NEIGHBOURS
+from udp_mesh.core.relaying.relaying import MAX_NEIGHBORS
 from udp_mesh.core.settings import Topic
 from udp_mesh.core.subscriptions.messages import ASK_TOPIC, TABLE_TOPIC, encode_ask, encode_table
 from udp_mesh.core.versions.encoding import Version
@@ -53,7 +53,7 @@ class FuzzedRelay:
             self.seeds.append(encode_carry(Carry(priority, 4, one[:8], three[:8], (), data)))
         self._channels = self.topology.nodes["n1"]._relaying._channels
         self._hop = self._channels.add(two)
-        self._source = next(link.address for link in self.topology.nodes["n2"]._relaying.neighbours[one].links.values())
+        self._source = next(link.address for link in self.topology.nodes["n2"]._relaying.neighbors[one].links.values())
 
     def receive(self, frame: bytes, *, to_all: bool) -> None:
         """A frame sealed by n1, at n2."""
@@ -66,8 +66,8 @@ class FuzzedRelay:
     def check_bounds(self) -> None:
         """Raises AssertionError if the relay holds more than its limits allow, or does not relay any more."""
         relaying = self.topology.nodes["n2"]._relaying
-        assert len(relaying.neighbours) <= MAX_NEIGHBOURS
-        assert relaying.forwarding.budget.memory_bytes <= MAX_NEIGHBOURS * MAX_HOP_BYTES
+        assert len(relaying.neighbors) <= MAX_NEIGHBORS
+        assert relaying.forwarding.budget.memory_bytes <= MAX_NEIGHBORS * MAX_HOP_BYTES
 
     def works(self) -> bool:
         """Whether a message still goes from one end to the other."""

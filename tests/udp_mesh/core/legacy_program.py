@@ -68,13 +68,13 @@ class LegacyProgram:
         return out
 
     def on_ack(self, ack: LegacyAck) -> None:
-        """An acknowledgement of a fragment that is not in flight is ignored."""
+        """An acknowledgment of a fragment that is not in flight is ignored."""
         self.in_flight.pop((ack.sequence, ack.position), None)
 
     # Receiving
 
     def on_fragment(self, fragment: LegacyPayload, now: float) -> tuple[LegacyAck, PriorityMeshData | None]:
-        """Its acknowledgement, and the message that it completes."""
+        """Its acknowledgment, and the message that it completes."""
         held = self.partials.setdefault(fragment.sequence, [None] * fragment.total)
         held[fragment.position] = (now, fragment.data)
         ack = LegacyAck(fragment.sequence, fragment.position)

@@ -172,7 +172,7 @@ def test_a_lost_request_to_send_again_is_repeated_and_not_taken_for_a_confirmati
 
 def test_a_late_confirmation_to_an_earlier_run_of_the_sender_disturbs_nothing() -> None:
     """A packet number of the earlier run, kept account of as one of the current run, would shift the meaning of all
-    acknowledgements that follow."""
+    acknowledgments that follow."""
     made = world()
     made.send("a", "kept", b"x", destination="b")
     made.run(1.0)

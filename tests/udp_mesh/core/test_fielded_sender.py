@@ -1,4 +1,4 @@
-"""A legacy robot on a lossy link: its program never retransmits, so our acknowledgements must keep it going."""
+"""A legacy robot on a lossy link: its program never retransmits, so our acknowledgments must keep it going."""
 
 from __future__ import annotations
 

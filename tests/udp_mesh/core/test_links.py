@@ -1,6 +1,6 @@
 """Goals on a modeled link in virtual time: goodput, latency of urgent messages, recovery, changes of the link.
 
-10 Mbit/s, 20 ms round trip, a queue of 100 packets, loss both ways (including acknowledgements) unless stated
+10 Mbit/s, 20 ms round trip, a queue of 100 packets, loss both ways (including acknowledgments) unless stated
 otherwise. Seeded, so the results are the same on every machine.
 """
 

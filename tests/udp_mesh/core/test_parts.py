@@ -1,4 +1,4 @@
-"""The small parts against simple slow models: ranges, packets in flight, reassembly, compression, acknowledgements,
+"""The small parts against simple slow models: ranges, packets in flight, reassembly, compression, acknowledgments,
 buckets."""
 
 import zlib

@@ -49,7 +49,7 @@ def test_skipping_a_quiet_node_misses_nothing() -> None:
 
 
 def test_receiving_bulk_needs_few_more_timers_than_idling() -> None:
-    """Each wake-up costs ten times what a datagram costs: acknowledgements already sent need no timer."""
+    """Each wake-up costs ten times what a datagram costs: acknowledgments already sent need no timer."""
     world = World(seed=5)
     for name in ("a", "b"):
         world.add(settings(name, *TOPICS))

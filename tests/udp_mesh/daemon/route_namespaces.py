@@ -111,7 +111,7 @@ def narrow_from_the_start() -> None:
             logged(daemon, f"mtu={NARROW_MTU} ")
             with daemon.client() as client:
                 page = status_view(client.request("status"))
-            assert f"the path to {peer} carries packets of {NARROW_MTU} bytes at most, link " in page
+            assert f"path to {peer}: packets of at most {NARROW_MTU} bytes (MTU of " in page
 
 
 def narrows_in_the_middle() -> None:

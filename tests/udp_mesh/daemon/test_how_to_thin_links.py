@@ -63,7 +63,7 @@ def test_the_configuration_of_the_guide_carries_a_stop_to_a_robot_without_wifi(r
                     lambda daemon=daemon: "ONLY HERE" in udp_mesh(daemon, "status") or None,  # type: ignore[misc]
                     f"{daemon.name} hears the other",
                 )
-            # before the stop: one that is lost beside the stop's acknowledgement is sent again only 30 s later
+            # before the stop: one that is lost beside the stop's acknowledgment is sent again only 30 s later
             udp_mesh(husky, "set", "position", "1", "2")
             poll(lambda: re.search(r"husky1 +1\.0 +2\.0", udp_mesh(base, "status")), "husky1's position arrives")
             with husky.client() as robot:

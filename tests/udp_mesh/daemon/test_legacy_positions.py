@@ -85,7 +85,7 @@ def test_a_restarted_daemon_frees_the_slots_of_a_legacy_sender(how: signal.Signa
             robot.sendto(datagram, ("127.0.3.1", port))
 
         def acknowledged() -> set[tuple[int, int]] | None:
-            """The acknowledgements that answer a heartbeat."""
+            """The acknowledgments that answer a heartbeat."""
             tell(encode_legacy(Host("old", "127.0.3.9")))
             found = set()
             try:
@@ -108,4 +108,4 @@ def test_a_restarted_daemon_frees_the_slots_of_a_legacy_sender(how: signal.Signa
             while acknowledged() is not None:
                 pass
             daemon.start()
-            assert {(501, 0), (502, 0), (503, 0)} <= poll(acknowledged, "acknowledgements")
+            assert {(501, 0), (502, 0), (503, 0)} <= poll(acknowledged, "acknowledgments")

@@ -312,11 +312,11 @@ class ForeignNode:
                     expected |= kind != BROADCAST
                     answer += self.piece(peer, fields, broadcast=fields["cast"] or kind == BROADCAST)
         if expected and kind != HELLO:
-            answer = self.acknowledgement(peer) + answer
+            answer = self.acknowledgment(peer) + answer
         if answer:
             self.say(peer, answer)
 
-    def acknowledgement(self, peer: Peer) -> bytes:
+    def acknowledgment(self, peer: Peer) -> bytes:
         largest = peer.largest
         missing = sum(1 << i for i in range(min(256, largest)) if largest - 1 - i not in peer.seen)
         bitmap = missing.to_bytes((missing.bit_length() + 7) // 8, "little")

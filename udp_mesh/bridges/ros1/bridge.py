@@ -218,7 +218,7 @@ class Ros1Bridge:
         self._check(published, table, topics, peers)
 
     def _system_state(self) -> SystemState:
-        """What other nodes publish and subscribe to; nothing while there is no master."""
+        """The topics that other nodes publish and subscribe to; none while there is no master."""
         try:
             return self._graph.system_state()
         except MASTER_ERRORS as error:
@@ -311,7 +311,7 @@ def _master_problem() -> str:
     """Why there is no master to connect to; "" if there is one."""
     if rosgraph.is_master_online():
         return ""
-    return "none answers at ROS_MASTER_URI={}".format(rosgraph.get_master_uri())
+    return "no answer at ROS_MASTER_URI={}".format(rosgraph.get_master_uri())
 
 
 def _wait_for(problem: Callable[[], str], what: str) -> None:

@@ -305,7 +305,7 @@ def parameters(default_socket: str) -> Parameters:
 
 
 def unknown_arguments(arguments: Sequence[str]) -> str:
-    """What is wrong with the command line; "" if nothing. rospy takes any `name:=value` and ignores all else.
+    """The fault of the command line; "" if there is none. rospy takes any `name:=value` and ignores all else.
 
     The launch file gives the bridge a path, too, which means nothing.
     """

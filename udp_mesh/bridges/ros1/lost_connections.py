@@ -22,10 +22,10 @@ class SystemState(NamedTuple):
 
 
 class LostConnections:
-    """Which names to register once more. One for publishers, one for subscribers."""
+    """Chooses the names to register again. One for publishers, one for subscribers."""
 
     def __init__(self) -> None:
-        # of each name, how many connections are missing, and in how many checks in a row
+        # by name: how many connections are missing, and in how many checks in a row
         self._checks: dict[str, tuple[int, int]] = {}
 
     def due(self, connected: Mapping[str, int], listed: Mapping[str, Iterable[str]]) -> list[str]:

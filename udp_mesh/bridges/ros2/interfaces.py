@@ -47,8 +47,8 @@ def unknown_type(name: str, error: Exception) -> str:
 def failed_response(type_name: str, response: Any, text: str) -> Optional[Any]:
     """`response` as the error of a call that got none; None for a service that has no way to say so.
 
-    Actions have: a goal that is rejected, a result of an aborted goal, a cancellation that is rejected. Of services,
-    those with the fields of std_srvs/srv/Trigger and SetBool.
+    Actions have: a goal that is rejected, a result of an aborted goal, a cancellation that is rejected. So do services
+    with the fields of std_srvs/srv/Trigger and SetBool.
     """
     if type_name.endswith("_SendGoal"):
         response.accepted = False

@@ -58,7 +58,7 @@ class CongestionController(Protocol):
         ...
 
     def assume_delivery(self) -> bool:
-        """Whether the link can be assumed to keep delivering while acknowledgements are late."""
+        """Whether the link can be assumed to keep delivering while acknowledgments are late."""
         ...
 
 

@@ -37,7 +37,7 @@ round trip was measured."""
 
 MIN_CWND = 4.0
 """Packets: below this, a lost packet has too few successors to be detected without a timeout. On a lossy path so many
-must be acknowledged: packets and acknowledgements are both lost, so the minimum is this divided by (1 - loss)²."""
+must be acknowledged: packets and acknowledgments are both lost, so the minimum is this divided by (1 - loss)²."""
 
 MAX_CWND = 8192.0
 """Packets: 92 Mbit at 1400 B, more than any link of these robots needs. Bounds the state per packet."""
@@ -83,7 +83,7 @@ STARTUP_RATE_BOUND = 2.5
 """Upper bounds of the window relative to what the measured rate needs; growth has to run ahead of the measurement."""
 
 ACK_BATCH_S = 0.008
-"""About how long batched acknowledgements keep packets in the window beyond the round trip."""
+"""About how long batched acknowledgments keep packets in the window beyond the round trip."""
 
 COMPETITIVE_DRAIN_INTERVAL_S = 4.0
 """Minimum time between two drains in competition: each gives the queue to the other flow for a round trip or two."""
@@ -368,7 +368,7 @@ class DelayBasedController:
         capacity = self.capacity_packets_per_s()
         if capacity is not None:
             factor = RATE_BOUND if self.phase is Phase.CRUISE and not self._growth.active else STARTUP_RATE_BOUND
-            # Packets waiting for a batched acknowledgement are in flight too, and lost ones occupy the window.
+            # Packets waiting for a batched acknowledgment are in flight too, and lost ones occupy the window.
             pipe = capacity * (min_rtt + ACK_BATCH_S) / (1 - min(self._loss, MAX_LOSS))
             packets = min(packets, max(INITIAL_CWND, factor * pipe + self._queue_packets(windowed_rtt)))
         return min(MAX_CWND, max(self._min_cwnd(), packets))

@@ -1,11 +1,11 @@
 """How much queue a sender keeps at the bottleneck, in packets.
 
-It covers batched acknowledgements and pacing, and delays urgent messages by as much. A short path needs less, a lossy
+It covers batched acknowledgments and pacing, and delays urgent messages by as much. A short path needs less, a lossy
 one more; nodes that share a channel keep less each (see `channel_share`).
 """
 
 QUEUE_S = 0.003
-"""Target queue at the bottleneck: covers batched acknowledgements and pacing, and adds this much to urgent latency."""
+"""Target queue at the bottleneck: covers batched acknowledgments and pacing, and adds this much to urgent latency."""
 
 MIN_QUEUE_S = 0.002
 QUEUE_PER_ROUND_TRIP = 0.3
@@ -16,7 +16,7 @@ FULL_LOSS_QUEUE_AT = 0.05
 """Losses leave holes in the queue: this much more keeps the link busy, limited by what urgent messages tolerate."""
 
 MIN_QUEUE_PACKETS = 2.0
-"""The same at low rates: fewer packets leave the link idle between acknowledgements."""
+"""The same at low rates: fewer packets leave the link idle between acknowledgments."""
 
 MIN_SHARED_QUEUE_PACKETS = 1.0
 """The same if other nodes send on the channel too and keep it busy."""
@@ -32,7 +32,7 @@ def target_queue_s(min_rtt: float) -> float:
 
 
 def loss_queue_s(loss: float) -> float:
-    """What is added for losses."""
+    """The additional queue for losses."""
     return LOSS_QUEUE_S * min(1.0, loss / FULL_LOSS_QUEUE_AT)
 
 

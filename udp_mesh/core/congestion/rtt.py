@@ -1,7 +1,7 @@
-"""Round-trip time to one peer: a sample per acknowledgement -> smoothed, minimum and windowed RTT.
+"""Round-trip time to one peer: a sample per acknowledgment -> smoothed, minimum and windowed RTT.
 
 *Minimum* is the path without queues (over about 5 s). *Windowed* is the current round trip without single late
-acknowledgements (minimum over half a round trip, at least 20 ms; longer on a path with jitter). Smoothed RTT and
+acknowledgments (minimum over half a round trip, at least 20 ms; longer on a path with jitter). Smoothed RTT and
 variation follow RFC 6298.
 """
 
@@ -30,7 +30,7 @@ INITIAL_PTO_S = 0.25
 """Until the first sample: the longest probe interval."""
 
 MIN_PTO_ROUND_TRIPS = 2.0
-"""An acknowledgement is always awaited for so many round trips: retransmitting everything before it can arrive would
+"""An acknowledgment is always awaited for so many round trips: retransmitting everything before it can arrive would
 keep a slow path slow."""
 
 MAX_RTT_OUTLIER_S = 2.0
@@ -69,7 +69,7 @@ class RttEstimator:
         self._windowed_samples: deque[tuple[float, float]] = deque()
 
     def sample(self, round_trip_s: float, now: float) -> None:
-        """Add a measured round trip, without the time the peer held its acknowledgement back."""
+        """Add a measured round trip, without the time the peer held its acknowledgment back."""
         round_trip_s = min(round_trip_s, max(MAX_RTT_OUTLIER_S, 2 * (self.smoothed_rtt or 0.0)))
         self.latest_rtt = round_trip_s
         if self.smoothed_rtt is None:
@@ -94,7 +94,7 @@ class RttEstimator:
         self.min_rtt = round_trip_s
 
     def pto_s(self, ack_delay_s: float, max_s: float = float("inf")) -> float:
-        """Probe timeout (RFC 9002, 6.2): time after the last progress in which the oldest packet or its acknowledgement
+        """Probe timeout (RFC 9002, 6.2): time after the last progress in which the oldest packet or its acknowledgment
         must have been lost; at most `max_s` on a path that is not itself slow."""
         if self.smoothed_rtt is None:
             return min(max_s, INITIAL_PTO_S)

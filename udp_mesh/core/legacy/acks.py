@@ -1,7 +1,7 @@
-"""Acknowledgements that keep a legacy sender going, which never retransmits and keeps three fragments in flight.
+"""Acknowledgments that keep a legacy sender going, which never retransmits and keeps three fragments in flight.
 
-A lost fragment or acknowledgement occupies one of its three slots for 10 s; then it drops its whole queue. It ignores
-acknowledgements of fragments that are not in flight. So, in addition to the acknowledgement of each fragment:
+A lost fragment or acknowledgment occupies one of its three slots for 10 s; then it drops its whole queue. It ignores
+acknowledgments of fragments that are not in flight. So, in addition to the acknowledgment of each fragment:
 
 1. Each is repeated once after a short time, and once more if there was recent loss.
 2. Fragments that must have been sent before one that arrived, and are missing, are acknowledged too: they will not be
@@ -30,7 +30,7 @@ REPEAT_LOSSY_S = 0.4
 LOSSY_FOR_S = 10.0
 
 PREDICT_INTERVAL_S = 0.05
-"""Interval of predicted acknowledgements while fragments arrive, and for `PREDICT_FOR_S` after the last one."""
+"""Interval of predicted acknowledgments while fragments arrive, and for `PREDICT_FOR_S` after the last one."""
 
 PREDICT_FOR_S = 1.0
 
@@ -49,12 +49,12 @@ MAX_REPEATS = 4096
 
 RESTORED_STEP, RESTORED_STEPS = 40, 16
 """Messages, and fragments of each incomplete one, that may have been sent after the position was saved: acknowledged
-step by step, so that a default receive buffer holds the acknowledgements of a step. All steps reach as far as a sender
+step by step, so that a default receive buffer holds the acknowledgments of a step. All steps reach as far as a sender
 of 600 messages a second comes in one second."""
 
 
 class ReceivePosition(NamedTuple):
-    """What was received from a legacy peer, so that the next run of this node can free its slots."""
+    """The newest messages received from a legacy peer, with which the next run of this node can free its slots."""
 
     latest: int
     """The latest message number."""
@@ -115,7 +115,7 @@ class LegacyAcks:
         for ack in more:
             self._repeat(ack, now)
         for sequence in self._skipped(fragment.sequence):
-            # They may only have been overtaken: their own acknowledgements go first.
+            # They may only have been overtaken: their own acknowledgments go first.
             for ack in _first(sequence):
                 self._repeat(ack, now)
         return more
@@ -131,7 +131,7 @@ class LegacyAcks:
         return [ack for sequence in following - self._incomplete.keys() for ack in _first(sequence)]
 
     def position(self) -> ReceivePosition | None:
-        """What the next run of this node needs to know (None: nothing was received)."""
+        """The position for the next run of this node (None: nothing was received)."""
         if self._latest is None:
             return None
         return ReceivePosition(
@@ -151,7 +151,7 @@ class LegacyAcks:
         return [number for number in numbers if number not in self._incomplete]
 
     def due(self, now: float) -> list[LegacyAck]:
-        """Repeated and predicted acknowledgements due now."""
+        """Repeated and predicted acknowledgments due now."""
         acks: list[LegacyAck] = []
         while self._repeats and self._repeats[0][0] <= now:
             at, ack, again = self._repeats.popleft()
@@ -168,7 +168,7 @@ class LegacyAcks:
         return acks
 
     def _predicts(self, now: float) -> bool:
-        """Whether predicted acknowledgements are sent without a heartbeat."""
+        """Whether predicted acknowledgments are sent without a heartbeat."""
         return self._restored_step < RESTORED_STEPS if self._restored else now < self._payload_at + PREDICT_FOR_S
 
     def next_at(self) -> float:

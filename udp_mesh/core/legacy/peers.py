@@ -151,7 +151,7 @@ class LegacyPeers:
         return len(self._by_host)
 
     def positions(self) -> dict[str, ReceivePosition]:
-        """What was received from each peer, for the next run of this node."""
+        """The receive position of each peer, for the next run of this node."""
         known = ((legacy.peer.name, legacy.acks.position()) for legacy in self._active())
         return {name: position for name, position in known if position is not None}
 
@@ -281,7 +281,7 @@ class LegacyPeers:
         return at
 
     def handle_timer(self, now: float) -> None:
-        """Send acknowledgements that are due; once a second heartbeats, offline checks and purges."""
+        """Send acknowledgments that are due; once a second heartbeats, offline checks and purges."""
         for legacy in self._active():
             if legacy.link:
                 self._acknowledge(legacy, legacy.acks.due(now))

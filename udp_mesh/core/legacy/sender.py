@@ -1,12 +1,12 @@
 """Messages to one legacy peer: fragments in priority order, a window of three, retransmitted until acknowledged.
 
 The legacy receiver acknowledges every fragment at once; the legacy sender never retransmits. This sender retransmits a
-fragment when its acknowledgement is overdue by the measured round trip, and probes an unresponsive peer with single
+fragment when its acknowledgment is overdue by the measured round trip, and probes an unresponsive peer with single
 fragments.
 
 The legacy receiver does not remember finished messages: it delivers a message again once all of its fragments came
 again. So no message is sent as a single fragment: a short one is followed by an empty second fragment, which is
-retransmitted only after the first one is acknowledged. A message then arrives twice only if both acknowledgements are
+retransmitted only after the first one is acknowledged. A message then arrives twice only if both acknowledgments are
 lost, or both late.
 """
 
@@ -55,7 +55,7 @@ RESENT_REMEMBERED = 64
 """Fragments acknowledged after a retransmission that may be acknowledged again."""
 
 TIMEOUT_DECAY = 0.995
-"""Decay toward `MIN_TIMEOUT_S` per acknowledgement of a first attempt: it takes some hundred of them."""
+"""Decay toward `MIN_TIMEOUT_S` per acknowledgment of a first attempt: it takes some hundred of them."""
 
 
 @dataclass(slots=True)
@@ -67,7 +67,7 @@ class _SentFragment:
     sent_at: float
     tries: int
     acks: int
-    """Acknowledgements of any fragment received when it was last sent."""
+    """Acknowledgments of any fragment received when it was last sent."""
     unanswered: int
     """Its attempts since the last of them."""
 
@@ -139,7 +139,7 @@ class LegacySender:
                     sender.finish(message, Outcome.SENT)
 
     def acknowledge(self, sequence: int, position: int, now: float) -> None:
-        """Process an acknowledgement; unknown ones are ignored."""
+        """Process an acknowledgment; unknown ones are ignored."""
         sent = self._in_flight.pop((sequence, position), None)
         self.unresponsive = False
         self._acks += 1
@@ -190,7 +190,7 @@ class LegacySender:
         return len(fragments) == 2 and not fragments[1]
 
     def _follows_first(self, sent: _SentFragment) -> bool:
-        """Whether this empty fragment waits for the acknowledgement of the first one before it is retransmitted."""
+        """Whether this empty fragment waits for the acknowledgment of the first one before it is retransmitted."""
         if not sent.position or not self._has_empty_tail(sent.message):
             return False
         return (self._fragments[sent.message][0], 0) in self._in_flight

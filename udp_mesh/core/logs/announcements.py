@@ -1,10 +1,9 @@
 """Announces to peers which items this node holds: everything at a meeting and once a minute, changes as follows.
 
-What a peer can act on at once is announced soon: a source's new items to all, any new items to readers, and to a source
-what its readers have. Everything else (what this node carries now, what a reader has) only saves others work: it
-travels with the next announcement, or within `CARRIED_S`. A peer gets the next announcement once it has acknowledged
-the one before, so that little is repeated to one that is out of reach.
-"""
+Changes that a peer can act on at once are announced soon: a source's new items to all, any new items to readers, and to
+a source what its readers have. Everything else (what this node carries now, what a reader has) only saves others work:
+it travels with the next announcement, or within `CARRIED_S`. A peer gets the next announcement once it has acknowledged
+the one before, so that little is repeated to one that is out of reach."""
 
 from __future__ import annotations
 
@@ -32,7 +31,7 @@ _NEVER = float("inf")
 
 @dataclass(slots=True)
 class _Pending:
-    """What was not announced to one peer yet."""
+    """Changes not yet announced to one peer."""
 
     logs: dict[LogKey, None] = field(default_factory=dict)
     due_at: float = _NEVER

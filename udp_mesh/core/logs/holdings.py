@@ -109,7 +109,7 @@ class Holdings:
         return state is not None and bool(readers) and not state.readers_without(item.number, readers)
 
     def log(self, key: LogKey) -> LogState | None:
-        """What is known of a log. None if there are too many, or its topic is none."""
+        """The state of a log. None if there are too many logs, or its topic is not a log."""
         state = self.logs.get(key)
         if state is None and key.topic in self._policy.topics and (len(self.logs) < MAX_LOGS or self.is_own_log(key)):
             state = self.logs[key] = LogState(key)

@@ -88,7 +88,7 @@ class LogState:
         return common
 
     def entry(self, readers: tuple[str, ...], *, reader_online: bool) -> HaveEntry:
-        """What this node announces."""
+        """This node's announcement."""
         holders = tuple(
             Holder(name, tuple(have.ranges()))
             for name, have in sorted(self.readers.items())
@@ -99,7 +99,7 @@ class LogState:
 
 @dataclass(slots=True, eq=False)
 class PeerView:
-    """What one online peer holds."""
+    """The items that one online peer holds."""
 
     held: dict[LogKey, RangeSet] = field(default_factory=dict)
     reader_online: set[LogKey] = field(default_factory=set)

@@ -1,7 +1,7 @@
 """The control messages of log nodes: `Have` (what the sender holds and what readers have) and `ItemRequest`.
 
 Both travel as messages of the reserved topic `CONTROL_TOPIC`, items as messages of `item_topic(topic)`: the transport's
-priorities, acknowledgements and encryption apply to them. Each list and range is bounded; a decoder returns a value or
+priorities, acknowledgments and encryption apply to them. Each list and range is bounded; a decoder returns a value or
 raises `DecodeError`.
 
     Have: 1 | flags 1 (bit 0: complete, bit 1: asks, bits 2-7: order) | entries 2, each:
@@ -54,7 +54,7 @@ def item_topic(topic: str) -> str:
 
 
 class Holder(NamedTuple):
-    """What a reader has of one log, as far as the sender knows."""
+    """The items of one log that a reader has, as far as the sender knows."""
 
     reader: str
     ranges: Ranges

@@ -1,4 +1,4 @@
-"""Which readers and carriers have this node's own items: reported once each to the program that published them."""
+"""Report which readers and carriers have this node's own items: once each, to the program that published them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which items this node requests now, and from which peer: the missing ones of every log, each from one peer at a time.
+"""Choose the items to request now, and from which peer: the missing ones of every log, each from one peer at a time.
 
 A reader requests what it lacks at once. A node that only carries never requests what all readers have, nor what enough
 others in reach carry already. It requests nothing over a weak link for a while: the same items cost a fraction of the

@@ -209,7 +209,7 @@ class Replicator:
                 self._leave_read(state, readers, now)
 
     def _leave_read(self, state: LogState, readers: tuple[str, ...], now: float) -> None:
-        """What all readers have now needs no carriers."""
+        """Withdraw items that all readers have now: they need no carriers."""
         everything = state.read_by_all(readers)
         if not self.policy.is_reader(state.key.topic):
             self._pulling.requests.remove(state.key, everything)
@@ -272,7 +272,7 @@ class Replicator:
         self.holdings.drop(item, reason, now)
 
     def _entry(self, key: LogKey, peer: str) -> HaveEntry | None:
-        """What is announced of a log to a peer."""
+        """The announcement of a log to a peer."""
         if key.topic not in self.policy.topics:
             return None
         online = self.policy.reader_online(key.topic, excluding=peer)

@@ -16,7 +16,7 @@ from udp_mesh.core.logs.messages import Ranges
 
 
 class ItemUse(IntEnum):
-    """What the programs of this node have to do with an item. The values are on disk."""
+    """How the programs of this node use an item. The values are on disk."""
 
     WAITING = 0
     """One of them is to get it."""
@@ -27,7 +27,7 @@ class ItemUse(IntEnum):
 
 
 class RememberedLog(NamedTuple):
-    """What is remembered of a log whose items were dropped."""
+    """The record of a log whose items were dropped."""
 
     log: LogKey
     received: Ranges
@@ -48,8 +48,8 @@ class StoredItem(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class LogContents:
-    """What a store holds when a node starts. `seed` is the secret of this node's logs; it lives and dies with them, so
-    that no number is used twice."""
+    """The contents of a store when a node starts. `seed` is the secret of this node's logs; it lives and dies with
+    them, so that no number is used twice."""
 
     seed: bytes
     items: tuple[StoredItem, ...] = ()

@@ -25,7 +25,7 @@ ZSTD_FEATURES = Feature.ZSTD | Feature.VERSIONS if zstd.AVAILABLE else 0
 
 
 def own_features(settings: Settings) -> int:
-    """What this node announces."""
+    """The features that this node announces."""
     features = OWN_FEATURES | ZSTD_FEATURES
     if settings.confirms:
         features |= Feature.CONFIRM

@@ -20,7 +20,7 @@ MAX_RETIRED = 16
 
 
 class VerifyResult(Enum):
-    """What the verification of a session means for its name."""
+    """The effect of a session's verification on its name."""
 
     NEW = 1
     RESTARTED = 2

@@ -1,1 +1,1 @@
-"""The receiving half of a session: opened datagrams in, complete messages and acknowledgements out."""
+"""The receiving half of a session: opened datagrams in, complete messages and acknowledgments out."""

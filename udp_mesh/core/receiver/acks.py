@@ -1,6 +1,6 @@
-"""Acknowledgement state of one peer: packet numbers in -> an acknowledgement now, soon, or not yet.
+"""Acknowledgment state of one peer: packet numbers in -> an acknowledgment now, soon, or not yet.
 
-An acknowledgement carries the largest packet number and a 256-bit bitmap below it. It is sent after a number of packets
+An acknowledgment carries the largest packet number and a 256-bit bitmap below it. It is sent after a number of packets
 or a delay, whichever comes first, or at once if a packet requests it.
 """
 
@@ -11,7 +11,7 @@ from udp_mesh.wire.limits import ACK_BITMAP_BITS
 _ALL = (1 << (ACK_BITMAP_BITS + 1)) - 1
 
 MAX_PENDING = ACK_BITMAP_BITS // 4
-"""An acknowledgement is due after this many packets in any case, so that each packet appears in four of them."""
+"""An acknowledgment is due after this many packets in any case, so that each packet appears in four of them."""
 
 
 LARGE_WINDOW_SPACING = 8
@@ -27,7 +27,7 @@ class AckState:
         self.largest = -1
         self.received = 0
         self.pending = 0
-        """Packets that request an acknowledgement, since the last one was sent."""
+        """Packets that request an acknowledgment, since the last one was sent."""
         self.requested = 0
         """Those of them that request one at once."""
         self.arrived_at = 0.0
@@ -60,12 +60,12 @@ class AckState:
 
     @property
     def is_late(self) -> bool:
-        """Whether the sender has requested another acknowledgement before this one was sent, which it does every fifth
+        """Whether the sender has requested another acknowledgment before this one was sent, which it does every fifth
         of its window."""
         return self.requested > 1 and self.pending < LARGE_WINDOW_SPACING * self.requested
 
     def on_ack_sent(self) -> None:
-        """Record that an acknowledgement was sent."""
+        """Record that an acknowledgment was sent."""
         if self.overtaken is not None:
             self.overtaken.pending = 0
         self.pending = 0

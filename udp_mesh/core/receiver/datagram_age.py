@@ -44,7 +44,7 @@ def echo_age_s(echo: int, now: float) -> float:
 
 
 class Freshness:
-    """What is known about one boot's clock, in its milliseconds and our seconds."""
+    """Measurements of one boot's clock, in its milliseconds and our seconds."""
 
     __slots__ = ("_offset_ms", "_set_at", "confirmed", "fresh_at", "trusted_until")
 

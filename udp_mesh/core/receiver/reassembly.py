@@ -54,7 +54,7 @@ class FragmentStatus(Enum):
     FORGOTTEN = 6
     """Its earlier fragments were dropped: the sender must restart the message."""
     EXPIRED = 7
-    """Its lifetime is over: its sender has already reported that and expects no acknowledgement."""
+    """Its lifetime is over: its sender has already reported that and expects no acknowledgment."""
 
 
 class _Partial:

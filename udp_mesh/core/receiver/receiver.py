@@ -1,4 +1,4 @@
-"""The receiving half of a session: opened datagrams in -> complete messages, acknowledgements and refusals out.
+"""The receiving half of a session: opened datagrams in -> complete messages, acknowledgments and refusals out.
 
 1. `receive_fragment` processes a fragment; a plain full fragment takes the fast path without building a frame.
 2. Fragments go to the reassembly of the channel they are numbered in (the sender's unicasts or its broadcasts).
@@ -264,7 +264,7 @@ class Receiver:
         return message_id in self.unicasts.finished and message_id not in self.unconfirmed
 
     def on_accepted(self, number: int, now: float, *, ack_now: bool) -> None:
-        """Record that a datagram that requests an acknowledgement was accepted."""
+        """Record that a datagram that requests an acknowledgment was accepted."""
         acks = self.acks
         acks.requested += ack_now
         if number > acks.largest + 1:
@@ -283,7 +283,7 @@ class Receiver:
             acks.due_at = now + self._rates.ack_delay_s
 
     def ack_overdue(self) -> bool:
-        """Whether so many packets are pending that an acknowledgement must be built before more arrive."""
+        """Whether so many packets are pending that an acknowledgment must be built before more arrive."""
         return self.acks.pending >= MAX_PENDING
 
     def _deliver(self, complete: CompleteMessage, by_broadcast: bool) -> bool:

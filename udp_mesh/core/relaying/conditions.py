@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True, slots=True)
-class RelayNeighbour:
+class RelayNeighbor:
     """A node heard directly that takes part in relaying."""
 
     name: str
@@ -70,7 +70,7 @@ class RelayConditions:
     """This node passes datagrams on."""
     active: bool
     """It relays, or hears a relay."""
-    neighbours: tuple[RelayNeighbour, ...]
+    neighbours: tuple[RelayNeighbor, ...]
     routes: tuple[RelayRoute, ...]
     counters: RelayCounters
     queued_bytes: int

@@ -11,7 +11,7 @@ from udp_mesh.core.interfaces import Datagram
 from udp_mesh.core.relaying.conditions import RelayCounters
 from udp_mesh.core.relaying.hop_channel import HopChannels
 from udp_mesh.core.relaying.hop_queue import QueueBudget, QueuedCarry
-from udp_mesh.core.relaying.neighbours import HopNeighbour
+from udp_mesh.core.relaying.neighbors import HopNeighbor
 from udp_mesh.core.relaying.routes import Routes
 from udp_mesh.core.state import State
 from udp_mesh.wire.limits import HEARD_TAG_BYTES
@@ -23,7 +23,7 @@ _NEVER = float("inf")
 
 
 class Forwarding:
-    """What waits here for next hops, and what is owed to previous ones."""
+    """The datagrams that wait for next hops, and the acknowledgments due to previous ones."""
 
     def __init__(self, state: State, channels: HopChannels, routes: Routes) -> None:
         self._state = state
@@ -32,12 +32,12 @@ class Forwarding:
         self._channels = channels
         self._routes = routes
         self.budget = QueueBudget(state.boot_id)
-        self.neighbours: dict[bytes, HopNeighbour] = {}
+        self.neighbors: dict[bytes, HopNeighbor] = {}
         self.counters = RelayCounters()
         self.tags: dict[bytes, bytes] = {}
         """First bytes of a boot id -> boot id, of selected routes."""
         self.ack_due: dict[bytes, None] = {}
-        """Neighbors to which an acknowledgement is owed."""
+        """Neighbors to which an acknowledgment is owed."""
         self.queued: dict[bytes, None] = {}
         """Neighbors to which something may be sent."""
 
@@ -58,12 +58,12 @@ class Forwarding:
         """Queue a datagram for its next hop."""
         boot_id = self.tags.get(item.carry.destination)
         route = None if boot_id is None else self._routes.selected.get(boot_id)
-        neighbour = None if route is None else self.neighbours.get(route.via)
-        if neighbour is None or neighbour.boot_id == item.previous:
+        neighbor = None if route is None else self.neighbors.get(route.via)
+        if neighbor is None or neighbor.boot_id == item.previous:
             self.counters.dropped_unreachable += 1
             return
-        neighbour.queue.push(item)
-        self.queued[neighbour.boot_id] = None
+        neighbor.queue.push(item)
+        self.queued[neighbor.boot_id] = None
 
     def accept(self, datagrams: Iterable[tuple[int, Datagram]], now: float) -> None:
         """Queue our own datagrams for nodes behind relays."""
@@ -76,44 +76,44 @@ class Forwarding:
 
     def send_acks(self, out: list[Datagram], own_round: int, now: float) -> None:
         for boot_id in list(self.ack_due):
-            neighbour = self.neighbours.get(boot_id)
-            if neighbour is not None and neighbour.ack_at > now:
+            neighbor = self.neighbors.get(boot_id)
+            if neighbor is not None and neighbor.ack_at > now:
                 continue
             del self.ack_due[boot_id]
-            link = None if neighbour is None else neighbour.best_link(own_round, now)
-            if neighbour is None or link is None:
+            link = None if neighbor is None else neighbor.best_link(own_round, now)
+            if neighbor is None or link is None:
                 continue
-            delay_us = min((1 << 24) - 1, int((now - neighbour.largest_at) * 1e6))
-            _, data = self._channels.seal(neighbour.hop, encode_hop_ack(HopAck(neighbour.largest, delay_us)))
-            neighbour.unacknowledged, neighbour.ack_at = 0, _NEVER
+            delay_us = min((1 << 24) - 1, int((now - neighbor.largest_at) * 1e6))
+            _, data = self._channels.seal(neighbor.hop, encode_hop_ack(HopAck(neighbor.largest, delay_us)))
+            neighbor.unacknowledged, neighbor.ack_at = 0, _NEVER
             out.append(Datagram(link.name, link.address, data, True))
 
     def send_queued(self, out: list[Datagram], own_round: int, now: float, room: int) -> None:
         urgent_priority = self._state.settings.rates.urgent_priority
         first: list[Datagram] = []
         for boot_id in list(self.queued):
-            neighbour = self.neighbours.get(boot_id)
-            link = None if neighbour is None else neighbour.best_link(own_round, now)
-            if neighbour is None or link is None:
+            neighbor = self.neighbors.get(boot_id)
+            link = None if neighbor is None else neighbor.best_link(own_round, now)
+            if neighbor is None or link is None:
                 del self.queued[boot_id]
                 continue
-            dropped = neighbour.queue.dropped
-            while neighbour.queue and room > 0:
-                if neighbour.queue.first_level > urgent_priority and not neighbour.window.has_room:
+            dropped = neighbor.queue.dropped
+            while neighbor.queue and room > 0:
+                if neighbor.queue.first_level > urgent_priority and not neighbor.window.has_room:
                     break
-                item = neighbour.queue.pop(now)
+                item = neighbor.queue.pop(now)
                 if item is None:
                     break
-                number, data = self._channels.seal(neighbour.hop, encode_carry(item.carry))
-                neighbour.window.on_sent(number, now)
+                number, data = self._channels.seal(neighbor.hop, encode_carry(item.carry))
+                neighbor.window.on_sent(number, now)
                 urgent = item.carry.priority <= urgent_priority
                 (first if urgent else out).append(Datagram(link.name, link.address, data, urgent))
                 room -= len(data)
                 if item.previous != self._own:
                     self.counters.passed_on += 1
                     self.counters.passed_on_bytes += item.size
-            self.counters.dropped_queue += neighbour.queue.dropped - dropped
+            self.counters.dropped_queue += neighbor.queue.dropped - dropped
             if room > 0:
-                # It waits for an acknowledgement, or has nothing more.
+                # It waits for an acknowledgment, or has nothing more.
                 del self.queued[boot_id]
         out[:0] = first

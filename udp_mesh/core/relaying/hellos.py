@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from udp_mesh.core.interfaces import Datagram
 from udp_mesh.core.peers.heartbeat import uses_link
 from udp_mesh.core.relaying.hop_channel import HopChannels
-from udp_mesh.core.relaying.neighbours import HopNeighbour, heard_on
+from udp_mesh.core.relaying.neighbors import HopNeighbor, heard_on
 from udp_mesh.core.sender.path import header_bytes
 from udp_mesh.core.settings import RELAY_LINK, LinkInfo, LinkKind
 from udp_mesh.core.state import State
@@ -35,7 +35,7 @@ MAX_PART_BYTES = 1152
 def hello_datagrams(
     state: State,
     channels: HopChannels,
-    neighbours: Sequence[HopNeighbour],
+    neighbors: Sequence[HopNeighbor],
     base: RelayHello,
     passes: Iterable[str] | None,
     now: float,
@@ -44,24 +44,24 @@ def hello_datagrams(
     named = None if passes is None else frozenset(passes)
     links = state.own_links()
     for link in links:
-        here = [neighbour for neighbour in neighbours if link.name in neighbour.links]
+        here = [neighbor for neighbor in neighbors if link.name in neighbor.links]
         if not (here or state.settings.relay.keys or _is_understood(state, link.name)):
             continue
         targets = [
-            neighbour.address
-            for neighbour in state.settings.neighbours
-            if not neighbour.legacy and uses_link(neighbour, link, links)
+            neighbor.address
+            for neighbor in state.settings.neighbours
+            if not neighbor.legacy and uses_link(neighbor, link, links)
         ]
         if link.kind is LinkKind.NEIGHBOURS:
-            targets += [neighbour.links[link.name].address for neighbour in here]
+            targets += [neighbor.links[link.name].address for neighbor in here]
         heard = [
             heard_on(
-                neighbour.links[link.name],
-                neighbour,
-                passes=base.relays and (named is None or neighbour.name in named),
+                neighbor.links[link.name],
+                neighbor,
+                passes=base.relays and (named is None or neighbor.name in named),
                 now=now,
             )
-            for neighbour in here
+            for neighbor in here
         ]
         for part in _parts(base, heard, _room(link)):
             data = channels.seal_hello(encode_hello(part))

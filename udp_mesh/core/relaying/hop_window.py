@@ -1,7 +1,7 @@
 """How many carried datagrams may be on their way to one neighbor, so that others wait here, in order of priority.
 
 Once per round trip `w <- w/2 + (w * min_rtt / rtt + a) / 2`, where `a` is what the hop delivers in `QUEUE_S`; before
-the first queue it doubles. Loss does not shrink it: the ends of the path retransmit. An acknowledgement covers all
+the first queue it doubles. Loss does not shrink it: the ends of the path retransmit. An acknowledgment covers all
 up to its number, so that what was lost before it is not outstanding.
 """
 
@@ -15,7 +15,7 @@ MAX_PACKETS = 2048.0
 MIN_RTT_FOR_S = 10.0
 """A smallest round trip is believed for this long: routes of the radio mesh change."""
 TIMEOUT_S = 0.25
-"""Without an acknowledgement for this long (and four round trips) what is on its way counts as lost."""
+"""Without an acknowledgment for this long (and four round trips) what is on its way counts as lost."""
 SUSPECT_AFTER = 2
 """So many timeouts in a row: the neighbor no longer hears us."""
 
@@ -43,7 +43,7 @@ class HopWindow:
         self.packets = INITIAL_PACKETS
         self.rtt: float | None = None
         self.timeouts = 0
-        """Consecutive ones, without an acknowledgement between them."""
+        """Consecutive ones, without an acknowledgment between them."""
         self._sent: deque[tuple[int, float]] = deque()
         self._min_rtt, self._min_rtt_at = float("inf"), 0.0
         self._doubling = True

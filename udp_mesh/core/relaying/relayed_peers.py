@@ -1,5 +1,5 @@
-"""Which peers the core reaches over `RELAY_LINK`: the link, whom its heartbeats go to, when it is better than a direct
-path, and how large datagrams on it may be."""
+"""The peers that the core reaches over `RELAY_LINK`: the link, the targets of its heartbeats, when it is better than a
+direct path, and how large datagrams on it may be."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ from udp_mesh.core.relaying.forwarding import BATCH_BYTES, Forwarding
 from udp_mesh.core.relaying.hellos import hello_datagrams
 from udp_mesh.core.relaying.hop_channel import HopChannels, membership_proof
 from udp_mesh.core.relaying.hop_queue import QueuedCarry
-from udp_mesh.core.relaying.neighbours import MISSED_HELLOS, HopNeighbour, make_neighbour, on_hello
+from udp_mesh.core.relaying.neighbors import MISSED_HELLOS, HopNeighbor, make_neighbor, on_hello
 from udp_mesh.core.relaying.relayed_peers import RelayedPeers
 from udp_mesh.core.relaying.routes import HopRoute, Routes
 from udp_mesh.core.sender.path import IP_UDP_BYTES
@@ -36,7 +36,7 @@ ACTIVE_FOR_S = 10.0
 """How long a node takes part after it last heard a relay."""
 FORGET_S = 30.0
 """Silence after which a neighbor is forgotten."""
-MAX_NEIGHBOURS = 256
+MAX_NEIGHBORS = 256
 """Neighbors at a time: only holders of the hop's key can invent them."""
 MAINTENANCE_S = 0.5
 MIN_HELLO_GAP_S = 0.2
@@ -56,7 +56,7 @@ class Relaying:
         self._channels = HopChannels(self._hop_keys(), state.boot_id)
         self.routes = Routes()
         self.forwarding = Forwarding(state, self._channels, self.routes)
-        self.neighbours = self.forwarding.neighbours
+        self.neighbors = self.forwarding.neighbors
         self.counters = self.forwarding.counters
         self.peers = RelayedPeers(state)
         self.round = 0
@@ -92,14 +92,14 @@ class Relaying:
     def apply(self, now: float) -> None:
         """Take over changed settings and keys."""
         self._channels.set_keys(self._hop_keys())
-        for boot_id, neighbour in self.neighbours.items():
-            neighbour.hop = self._channels.add(boot_id)
+        for boot_id, neighbor in self.neighbors.items():
+            neighbor.hop = self._channels.add(boot_id)
         if self.relays:
             self._hello_soon(now)
         if not self.takes_part:
-            for boot_id in list(self.neighbours):
+            for boot_id in list(self.neighbors):
                 self._forget(boot_id)
-        self._select(self.routes.known() | set(self.neighbours), now)
+        self._select(self.routes.known() | set(self.neighbors), now)
 
     # Receiving
 
@@ -110,7 +110,7 @@ class Relaying:
             return
         self._state.event_queue.counters.datagrams_received += 1
         self._state.event_queue.counters.bytes_received += len(data) + IP_UDP_BYTES
-        known = len(self.neighbours)
+        known = len(self.neighbors)
         try:
             boot_id, is_hello, number, raw = self._channels.open(data)
             frame = decode_relay(raw)
@@ -118,36 +118,36 @@ class Relaying:
             self.counters.dropped_unauthenticated += 1
             self._state.event_queue.counters.dropped_unauthenticated += 1
             return
-        neighbour = self.neighbours.get(boot_id)
-        if is_hello != isinstance(frame, RelayHello) or (neighbour is None and not isinstance(frame, RelayHello)):
+        neighbor = self.neighbors.get(boot_id)
+        if is_hello != isinstance(frame, RelayHello) or (neighbor is None and not isinstance(frame, RelayHello)):
             self._state.event_queue.counters.dropped_malformed += 1
             return
         match frame:
             case RelayHello():
-                if neighbour is None and known >= MAX_NEIGHBOURS:
+                if neighbor is None and known >= MAX_NEIGHBORS:
                     self._channels.forget(boot_id)
                 else:
-                    self._on_hello(neighbour, boot_id, frame, link, source, now)
+                    self._on_hello(neighbor, boot_id, frame, link, source, now)
             case HopAck(largest, delay_us):
-                assert neighbour is not None
-                neighbour.window.on_ack(largest, delay_us * 1e-6, now)
-                if neighbour.queue:
+                assert neighbor is not None
+                neighbor.window.on_ack(largest, delay_us * 1e-6, now)
+                if neighbor.queue:
                     self.forwarding.queued[boot_id] = None
             case Carry():
-                assert neighbour is not None
-                neighbour.on_carried(number, now)
+                assert neighbor is not None
+                neighbor.on_carried(number, now)
                 self.forwarding.ack_due[boot_id] = None
-                self._on_carry(neighbour, frame, now)
+                self._on_carry(neighbor, frame, now)
 
     def _on_hello(
-        self, neighbour: HopNeighbour | None, boot_id: bytes, hello: RelayHello, link: str, source: Address, now: float
+        self, neighbor: HopNeighbor | None, boot_id: bytes, hello: RelayHello, link: str, source: Address, now: float
     ) -> None:
-        if neighbour is None:
-            neighbour = make_neighbour(self._channels.add(boot_id), self.forwarding.budget)
-            self.neighbours[boot_id] = neighbour
-        before = neighbour.cost(self.round, now)
+        if neighbor is None:
+            neighbor = make_neighbor(self._channels.add(boot_id), self.forwarding.budget)
+            self.neighbors[boot_id] = neighbor
+        before = neighbor.cost(self.round, now)
         info = self._state.links[link]
-        hop_link = on_hello(neighbour, hello, self._own_tag, link, source, info.mtu, now)
+        hop_link = on_hello(neighbor, hello, self._own_tag, link, source, info.mtu, now)
         if hello.relays:
             self._relay_heard_at = now
             about = self.routes.on_offers(boot_id, hello.nodes, self._own, now)
@@ -162,7 +162,7 @@ class Relaying:
             about |= self.routes.known()
         self._select(about | {boot_id}, now)
 
-    def _on_carry(self, previous: HopNeighbour, carry: Carry, now: float) -> None:
+    def _on_carry(self, previous: HopNeighbor, carry: Carry, now: float) -> None:
         if self._own_mark in carry.visited or carry.origin == self._own_tag:
             self.counters.dropped_loop += 1
         elif carry.destination == self._own_tag:
@@ -211,27 +211,27 @@ class Relaying:
 
     def next_at(self) -> float:
         """When `handle_timer` or `transmit` is due next."""
-        if not self.neighbours and self._hello_at == _NEVER:
+        if not self.neighbors and self._hello_at == _NEVER:
             return _NEVER
         at = min(self._hello_at, self._maintenance_at)
         for boot_id in self.forwarding.ack_due:
-            at = min(at, self.neighbours[boot_id].ack_at if boot_id in self.neighbours else at)
-        for neighbour in self.neighbours.values():
-            timeout_at = neighbour.window.timeout_at()
+            at = min(at, self.neighbors[boot_id].ack_at if boot_id in self.neighbors else at)
+        for neighbor in self.neighbors.values():
+            timeout_at = neighbor.window.timeout_at()
             if timeout_at is not None and timeout_at < at:
                 at = timeout_at
         return at
 
     def handle_timer(self, now: float) -> None:
         """Do what is due at `now`."""
-        for neighbour in self.neighbours.values():
-            timeout_at = neighbour.window.timeout_at()
+        for neighbor in self.neighbors.values():
+            timeout_at = neighbor.window.timeout_at()
             if timeout_at is not None and timeout_at <= now:
-                suspect = neighbour.window.suspect
-                neighbour.window.on_timeout(now)
-                if neighbour.queue:
-                    self.forwarding.queued[neighbour.boot_id] = None
-                if neighbour.window.suspect and not suspect:
+                suspect = neighbor.window.suspect
+                neighbor.window.on_timeout(now)
+                if neighbor.queue:
+                    self.forwarding.queued[neighbor.boot_id] = None
+                if neighbor.window.suspect and not suspect:
                     self._select(self.routes.known(), now)
         if self._hello_at <= now:
             self._send_hellos(now)
@@ -241,22 +241,22 @@ class Relaying:
 
     def _maintain(self, now: float) -> None:
         self._channels.age(now)
-        for boot_id, neighbour in list(self.neighbours.items()):
-            if now - neighbour.heard_at() > FORGET_S:
+        for boot_id, neighbor in list(self.neighbors.items()):
+            if now - neighbor.heard_at() > FORGET_S:
                 self._forget(boot_id)
                 continue
-            for name, link in list(neighbour.links.items()):
+            for name, link in list(neighbor.links.items()):
                 if name not in self._state.links or now - link.hello_at > FORGET_S:
-                    del neighbour.links[name]
-        self.routes.expire(self.neighbours, now)
+                    del neighbor.links[name]
+        self.routes.expire(self.neighbors, now)
         self.routes.forget_announced(now)
         if self.active(now) and self._hello_at == _NEVER:
             self._hello_soon(now)
-        self._select(self.routes.known() | set(self.neighbours), now)
+        self._select(self.routes.known() | set(self.neighbors), now)
 
     def _forget(self, boot_id: bytes) -> None:
-        neighbour = self.neighbours.pop(boot_id)
-        self.counters.dropped_unreachable += len(neighbour.queue.drain())
+        neighbor = self.neighbors.pop(boot_id)
+        self.counters.dropped_unreachable += len(neighbor.queue.drain())
         self._channels.forget(boot_id)
         self.forwarding.ack_due.pop(boot_id, None)
         self.forwarding.queued.pop(boot_id, None)
@@ -271,7 +271,7 @@ class Relaying:
             return
         state, relay = self._state, self._state.settings.relay
         rates = state.settings.rates
-        interval_s = max(rates.heartbeat_s, len(self.neighbours) / rates.heartbeats_heard_per_s)
+        interval_s = max(rates.heartbeat_s, len(self.neighbors) / rates.heartbeats_heard_per_s)
         self.round += 1
         self._hello_sent_at = now
         self._hello_at = now + interval_s * (1 - JITTER * state.rng.random())
@@ -287,12 +287,12 @@ class Relaying:
             tuple(nodes),
         )
         passes = None if relay.all else relay.names
-        neighbours = [
-            neighbour
-            for neighbour in self.neighbours.values()
-            if now - neighbour.heard_at() <= MISSED_HELLOS * neighbour.interval_s
+        neighbors = [
+            neighbor
+            for neighbor in self.neighbors.values()
+            if now - neighbor.heard_at() <= MISSED_HELLOS * neighbor.interval_s
         ]
-        self._out.extend(hello_datagrams(state, self._channels, neighbours, base, passes, now))
+        self._out.extend(hello_datagrams(state, self._channels, neighbors, base, passes, now))
 
     # Routes
 
@@ -300,7 +300,7 @@ class Relaying:
         """Choose routes again, tell the core, and move what waits for a next hop that is no longer used."""
         # The order of a set differs from process to process, and a simulation must not.
         boot_ids = sorted(nodes)
-        changed = self.routes.select(boot_ids, self.neighbours, self.round, self._max_hops, now)
+        changed = self.routes.select(boot_ids, self.neighbors, self.round, self._max_hops, now)
         for before, after in changed:
             if before is not None and after is None:
                 self.forwarding.tags.pop(before.boot_id[:HEARD_TAG_BYTES], None)
@@ -313,22 +313,22 @@ class Relaying:
             self._on_changed(before, after)
 
     def _on_changed(self, before: HopRoute | None, after: HopRoute | None) -> None:
-        old = self.neighbours.get(before.via) if before is not None else None
+        old = self.neighbors.get(before.via) if before is not None else None
         if old is not None and old.queue:
             for item in old.queue.drain():
                 self.forwarding.queue(item)
         if after is not None and not after.direct and self.peers.is_in_use(after.boot_id):
-            via = self.neighbours[after.via].name
+            via = self.neighbors[after.via].name
             self._state.event_queue.emit(PeerRouteChanged(after.name, via, after.hops))
 
     # Conditions
 
     def addresses(self) -> Iterable[tuple[str, Address]]:
         """Links and addresses of neighbors: a driver reads what comes from there as from peers."""
-        for neighbour in self.neighbours.values():
-            for link in neighbour.links.values():
+        for neighbor in self.neighbors.values():
+            for link in neighbor.links.values():
                 yield link.name, link.address
 
     @property
     def queued_bytes(self) -> int:
-        return sum(neighbour.queue.bytes for neighbour in self.neighbours.values())
+        return sum(neighbor.queue.bytes for neighbor in self.neighbors.values())

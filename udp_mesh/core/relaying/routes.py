@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
-from udp_mesh.core.relaying.neighbours import HopNeighbour
+from udp_mesh.core.relaying.neighbors import HopNeighbor
 from udp_mesh.wire.relay import UNREACHABLE, RelayedNode
 
 KEEP_FACTOR = 1.25
@@ -87,12 +87,12 @@ class Routes:
         if not offers:
             del self._offers[boot_id]
 
-    def expire(self, neighbours: Mapping[bytes, HopNeighbour], now: float) -> None:
+    def expire(self, neighbors: Mapping[bytes, HopNeighbor], now: float) -> None:
         """Drop entries that were not repeated, or whose relay is gone."""
         for boot_id, offers in list(self._offers.items()):
             for relay, offer in list(offers.items()):
-                neighbour = neighbours.get(relay)
-                if neighbour is None or now - offer.at > OFFER_FOR_INTERVALS * neighbour.interval_s:
+                neighbor = neighbors.get(relay)
+                if neighbor is None or now - offer.at > OFFER_FOR_INTERVALS * neighbor.interval_s:
                     self._remove(boot_id, relay)
 
     def known(self) -> set[bytes]:
@@ -108,20 +108,18 @@ class Routes:
     def select(
         self,
         boot_ids: Iterable[bytes],
-        neighbours: Mapping[bytes, HopNeighbour],
+        neighbors: Mapping[bytes, HopNeighbor],
         own_round: int,
         max_hops: int,
         now: float,
     ) -> list[tuple[HopRoute | None, HopRoute | None]]:
         """Choose the routes to these nodes again. Returns (before, after) of those that changed their next hop."""
         changed = []
-        costs = {boot_id: neighbour.cost(own_round, now) for boot_id, neighbour in neighbours.items()}
+        costs = {boot_id: neighbor.cost(own_round, now) for boot_id, neighbor in neighbors.items()}
         for boot_id in boot_ids:
             before = self.selected.get(boot_id)
             candidates = [
-                route
-                for route in self._candidates(boot_id, neighbours, costs, own_round, now)
-                if route.hops <= max_hops
+                route for route in self._candidates(boot_id, neighbors, costs, own_round, now) if route.hops <= max_hops
             ]
             after = min(candidates, key=lambda route: (route.cost, route.hops, route.via), default=None)
             if before is not None and after is not None and after.via != before.via:
@@ -141,24 +139,24 @@ class Routes:
     def _candidates(
         self,
         boot_id: bytes,
-        neighbours: Mapping[bytes, HopNeighbour],
+        neighbors: Mapping[bytes, HopNeighbor],
         costs: Mapping[bytes, int | None],
         own_round: int,
         now: float,
     ) -> Iterable[HopRoute]:
-        direct, cost = neighbours.get(boot_id), costs.get(boot_id)
+        direct, cost = neighbors.get(boot_id), costs.get(boot_id)
         if direct is not None and cost is not None:
             link = direct.best_link(own_round, now)
             mtu = link.mtu if link is not None else 0
             yield HopRoute(boot_id, direct.name, boot_id, 1, cost, mtu, direct.round, True, direct.proofs)
         for relay, offer in self._offers.get(boot_id, {}).items():
             node, cost = offer.node, costs.get(relay)
-            neighbour = neighbours.get(relay)
-            if neighbour is None or cost is None or not neighbour.relays or not (node.open or neighbour.passes_us):
+            neighbor = neighbors.get(relay)
+            if neighbor is None or cost is None or not neighbor.relays or not (node.open or neighbor.passes_us):
                 continue
             if not self._is_feasible(node):
                 continue
-            link = neighbour.best_link(own_round, now)
+            link = neighbor.best_link(own_round, now)
             mtu = min(node.mtu, link.mtu if link is not None else node.mtu)
             total = min(UNREACHABLE - 1, node.cost + cost)
             yield HopRoute(boot_id, node.name, relay, node.hops + 1, total, mtu, node.round, node.open, node.proofs)

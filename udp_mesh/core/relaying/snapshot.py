@@ -6,9 +6,9 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from udp_mesh.core.relaying.conditions import RelayConditions, RelayNeighbour, RelayRoute
+from udp_mesh.core.relaying.conditions import RelayConditions, RelayNeighbor, RelayRoute
 from udp_mesh.core.relaying.hop_channel import is_member
-from udp_mesh.core.relaying.neighbours import LINK_COST, HopNeighbour
+from udp_mesh.core.relaying.neighbors import LINK_COST, HopNeighbor
 from udp_mesh.core.relaying.routes import HopRoute
 from udp_mesh.core.state import State
 from udp_mesh.wire.limits import HEARD_TAG_BYTES
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 def snapshot(state: State, relaying: Relaying, now: float) -> RelayConditions:
     """See `Endpoint.relaying`."""
-    names = relaying.routes.names() | {boot_id: neighbor.name for boot_id, neighbor in relaying.neighbours.items()}
+    names = relaying.routes.names() | {boot_id: neighbor.name for boot_id, neighbor in relaying.neighbors.items()}
     members = _members(state, relaying)
     routes = [
         _route(relaying, route, names, members) for route in relaying.routes.selected.values() if not route.direct
@@ -28,32 +28,32 @@ def snapshot(state: State, relaying: Relaying, now: float) -> RelayConditions:
     return RelayConditions(
         relaying.relays,
         relaying.active(now),
-        tuple(sorted(_neighbours(state, relaying, now), key=lambda neighbor: neighbor.name)),
+        tuple(sorted(_neighbors(state, relaying, now), key=lambda neighbor: neighbor.name)),
         tuple(sorted(routes, key=lambda route: route.name)),
         replace(relaying.counters),
         relaying.queued_bytes,
     )
 
 
-def _neighbours(state: State, relaying: Relaying, now: float) -> Iterator[RelayNeighbour]:
-    for neighbour in relaying.neighbours.values():
-        link = neighbour.best_link(relaying.round, now)
-        yield RelayNeighbour(
-            neighbour.name,
+def _neighbors(state: State, relaying: Relaying, now: float) -> Iterator[RelayNeighbor]:
+    for neighbor in relaying.neighbors.values():
+        link = neighbor.best_link(relaying.round, now)
+        yield RelayNeighbor(
+            neighbor.name,
             None if link is None else link.name,
-            neighbour.relays,
-            is_member(state.keys, neighbour.boot_id, neighbour.proofs),
-            0.0 if link is None else min(1.0, LINK_COST / link.cost(neighbour.interval_s, now)),
-            neighbour.window.suspect,
-            neighbour.queue.bytes,
-            neighbour.window.packets,
-            neighbour.window.rtt,
+            neighbor.relays,
+            is_member(state.keys, neighbor.boot_id, neighbor.proofs),
+            0.0 if link is None else min(1.0, LINK_COST / link.cost(neighbor.interval_s, now)),
+            neighbor.window.suspect,
+            neighbor.queue.bytes,
+            neighbor.window.packets,
+            neighbor.window.rtt,
         )
 
 
 def _members(state: State, relaying: Relaying) -> set[bytes]:
     """Boot ids of the nodes that hold one of our fleet keys."""
-    known: list[HopNeighbour | HopRoute] = [*relaying.neighbours.values(), *relaying.routes.selected.values()]
+    known: list[HopNeighbor | HopRoute] = [*relaying.neighbors.values(), *relaying.routes.selected.values()]
     return {neighbor.boot_id for neighbor in known if is_member(state.keys, neighbor.boot_id, neighbor.proofs)}
 
 

@@ -111,7 +111,7 @@ class OutgoingMessage:
         """It ends as delivered only when the peer confirms that, not when its fragments are acknowledged."""
         self.ended = False
         self.overdue = False
-        """Past its deadline: only its acknowledgement is awaited."""
+        """Past its deadline: only its acknowledgment is awaited."""
         self.superseded = False
         """Replaced by a newer message: its lost fragments are not retransmitted."""
         self.wire_id: int | None = None

@@ -2,7 +2,8 @@
 
 
 class Packing:
-    """Of one peer. A datagram counts if it is not urgent, and has room to spare or holds several messages."""
+    """The packing state of one peer. A datagram counts if it is not urgent, and has room to spare or holds several
+    messages."""
 
     __slots__ = ("is_stream", "sent_at", "waiting")
 

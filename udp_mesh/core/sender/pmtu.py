@@ -47,8 +47,8 @@ LOSS_MEMORY_PACKETS = 64
 chance."""
 
 SUSPECT_S = 2.5
-"""The minimum time from the first round without a large acknowledgement. If the round trip has just grown to a second
-or two, acknowledgements are still on their way, and fragments cut again would arrive twice."""
+"""The minimum time from the first round without a large acknowledgment. If the round trip has just grown to a second
+or two, acknowledgments are still on their way, and fragments cut again would arrive twice."""
 
 PROBES_PER_SMALL = LOST_PER_ROUND + 1
 """Of the probes of an unresponsive peer, one in so many is small; a round uses the others."""

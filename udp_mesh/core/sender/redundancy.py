@@ -1,4 +1,4 @@
-"""Redundant copies of small urgent fragments on a lossy path: sent -> copied soon, and again if the acknowledgement is
+"""Redundant copies of small urgent fragments on a lossy path: sent -> copied soon, and again if the acknowledgment is
 overdue.
 
 1. `schedule` records when the copies of a fragment sent for the first time are due.
@@ -13,10 +13,10 @@ from heapq import heappop, heappush
 from udp_mesh.core.sender.message import OutgoingMessage
 
 OVERDUE_ROUND_TRIPS = 1.1
-"""Round trips after which the acknowledgement of an urgent fragment, requested at once, is overdue."""
+"""Round trips after which the acknowledgment of an urgent fragment, requested at once, is overdue."""
 
 MAX_OVERDUE_COPIES = 6
-"""Copies sent for overdue acknowledgements; after that the peer is nearly unresponsive and is probed instead."""
+"""Copies sent for overdue acknowledgments; after that the peer is nearly unresponsive and is probed instead."""
 
 EARLY_COPIES = ((0.1, 3), (0.15, 6))
 """(loss, gaps): from this loss rate on, one more copy is sent so many gaps after the first. Losses come in bursts, so

@@ -121,7 +121,7 @@ class Scheduler:
         return not self.waiting & ~(1 << priority) and self._levels[priority].empty()
 
     def peek(self, priority: int) -> Run | None:
-        """What is sent next on this level. None, with the level's bit cleared, if it is empty."""
+        """The fragments to send next on this level. None, with the level's bit cleared, if it is empty."""
         level = self._levels[priority]
         if level.fresh and not level.retransmit and not level.stale_next:
             message = level.fresh[0]

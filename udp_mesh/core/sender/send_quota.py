@@ -1,14 +1,14 @@
 """How many packets may be sent to one peer now, and when to try again.
 
-1. `cwnd_room`: the room in the congestion window, plus what the link should have delivered while acknowledgements are
+1. `cwnd_room`: the room in the congestion window, plus what the link should have delivered while acknowledgments are
    late.
 2. `send_quota`: that plus the excess for urgent fragments, which no drain holds back; for others at most what pacing
    allows. An unresponsive peer gets only probes.
-3. `next_send_at`: when nothing may be sent, the time at which pacing or a late acknowledgement changes that.
-4. `ack_spacing`: how often packets request an acknowledgement, which determines when one is late.
+3. `next_send_at`: when nothing may be sent, the time at which pacing or a late acknowledgment changes that.
+4. `ack_spacing`: how often packets request an acknowledgment, which determines when one is late.
 5. `pack_until`: how long small messages wait to share a datagram.
 
-Acknowledgements are lost in bursts or delayed by a process that was not scheduled. A window that waits for them leaves
+Acknowledgments are lost in bursts or delayed by a process that was not scheduled. A window that waits for them leaves
 the link idle, so the link is assumed to keep delivering for some tens of milliseconds.
 """
 
@@ -16,17 +16,17 @@ from udp_mesh.core.sender.send_state import SendState
 from udp_mesh.core.sender.sender import Sender
 
 MAX_ACK_SPACING = 10
-"""Maximum packets between two requests for an immediate acknowledgement."""
+"""Maximum packets between two requests for an immediate acknowledgment."""
 
 ACK_SPACING_FRACTION = 0.2
-"""Fraction of the window between two requests for an immediate acknowledgement."""
+"""Fraction of the window between two requests for an immediate acknowledgment."""
 
 MIN_LOSS_FACTOR = 0.5
 LOSS_WEIGHT = 5.0
-"""Acknowledgements are lost too: each percent of loss requests them 5 % more often, up to twice as often."""
+"""Acknowledgments are lost too: each percent of loss requests them 5 % more often, up to twice as often."""
 
 LATE_AFTER_S = 0.006
-"""Acknowledgements are late when overdue by more than their spacing, and by at least this long."""
+"""Acknowledgments are late when overdue by more than their spacing, and by at least this long."""
 
 MAX_URGENT_WAIT_S = 0.1
 """Maximum wait of an urgent fragment for packets in flight, which may be in a queue of seconds or lost unnoticed. One
@@ -77,7 +77,7 @@ def urgent_wait_until(sender: Sender) -> float:
 
 
 def next_send_at(sender: Sender, room: int, now: float, packets_per_s: float | None) -> float | None:
-    """When more may be sent even if nothing arrives. None: only an acknowledgement changes anything."""
+    """When more may be sent even if nothing arrives. None: only an acknowledgment changes anything."""
     if sender.state is SendState.UNRESPONSIVE:
         return None
     if room > 0:
@@ -93,13 +93,13 @@ def next_send_at(sender: Sender, room: int, now: float, packets_per_s: float | N
 
 
 def ack_spacing(sender: Sender) -> int:
-    """Packets between two requests for an immediate acknowledgement."""
+    """Packets between two requests for an immediate acknowledgment."""
     loss_factor = max(MIN_LOSS_FACTOR, 1.0 - LOSS_WEIGHT * sender.loss.rate)
     return max(2, min(MAX_ACK_SPACING, int(sender.congestion.cwnd * ACK_SPACING_FRACTION * loss_factor)))
 
 
 def _late_at(sender: Sender) -> float:
-    """When the next acknowledgement was due."""
+    """When the next acknowledgment was due."""
     capacity = sender.congestion.capacity_packets_per_s()
     spacing_s = ack_spacing(sender) / capacity if capacity else 0.0
     return sender.last_progress + max(LATE_AFTER_S, spacing_s)
@@ -110,7 +110,7 @@ def pack_until(sender: Sender, priority: int, room_bytes: int, now: float) -> fl
     frames; `now`: they do not.
 
     As with Nagle's algorithm (RFC 896), a message is sent at once while none before it is in flight, so a lone one, and
-    one that follows the acknowledgement of the last, never wait. In a stream, each datagram is followed by `pack_s`
+    one that follows the acknowledgment of the last, never wait. In a stream, each datagram is followed by `pack_s`
     without another, unless one is full.
     """
     packing = sender.packing

@@ -1,6 +1,6 @@
 """Whether the peer acknowledges what is sent to it, as one transition table.
 
-ACTIVE -> TIMING_OUT when packets time out -> UNRESPONSIVE without any progress; an acknowledgement or a restart of the
+ACTIVE -> TIMING_OUT when packets time out -> UNRESPONSIVE without any progress; an acknowledgment or a restart of the
 peer returns to ACTIVE.
 """
 
@@ -10,7 +10,7 @@ from enum import Enum
 class SendState(Enum):
     ACTIVE = 1
     TIMING_OUT = 2
-    """Acknowledgements stay away: packets are declared lost by their age."""
+    """Acknowledgments stay away: packets are declared lost by their age."""
     UNRESPONSIVE = 3
     """Nothing was acknowledged for long, or the peer is offline: only probes are sent."""
 

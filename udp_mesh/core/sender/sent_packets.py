@@ -1,6 +1,6 @@
 """The packets in flight to one peer: sent -> acknowledged or lost.
 
-Packet numbers grow by one and are never reused, so packets form a queue by number, and an acknowledgement's bitmap is
+Packet numbers grow by one and are never reused, so packets form a queue by number, and an acknowledgment's bitmap is
 applied from its front: usually a run of ones. A packet is lost when `reorder_packets` later ones arrived; if it arrives
 after all, that threshold grows. Urgent packets overtake others in a radio's queues (Wi-Fi access categories), so their
 arrival says nothing about less urgent ones sent before them.
@@ -20,7 +20,7 @@ MAX_REORDER_PACKETS = 64
 """Upper bound of the learned reordering threshold."""
 
 MAX_REMEMBERED_LOST = 256
-"""Lost packets that a later acknowledgement may correct: those its bitmap covers."""
+"""Lost packets that a later acknowledgment may correct: those its bitmap covers."""
 
 
 class SendSnapshot(NamedTuple):
@@ -79,7 +79,7 @@ class SentPackets:
         self.reorder_packets = REORDER_PACKETS
         self._lost: OrderedDict[int, tuple[Packet, bool]] = OrderedDict()
         self._timed_out: list[int] = []
-        """Numbers of urgent packets declared lost by age and not yet covered by an acknowledgement."""
+        """Numbers of urgent packets declared lost by age and not yet covered by an acknowledgment."""
         self.spurious = 0
 
     @property
@@ -91,8 +91,8 @@ class SentPackets:
         return sum(packet is not None and not packet.snapshot.urgent for packet in self._packets)
 
     def add(self, number: int, packet: Packet | None) -> None:
-        """Record a sent packet; None for one that requests no acknowledgement. Called for every number of the channel,
-        in order, from when it has a sender: earlier ones requested no acknowledgement."""
+        """Record a sent packet; None for one that requests no acknowledgment. Called for every number of the channel,
+        in order, from when it has a sender: earlier ones requested no acknowledgment."""
         packets = self._packets
         if not packets:
             self.base = number if packet is not None else number + 1
@@ -115,7 +115,7 @@ class SentPackets:
         """Returns the newly acknowledged packets, the packets now lost, and packet `largest` if it was not acknowledged
         before.
 
-        `received` is as in `AckState`. An acknowledgement of a number never sent is ignored. A packet declared lost too
+        `received` is as in `AckState`. An acknowledgment of a number never sent is ignored. A packet declared lost too
         early is returned as `largest` too: otherwise a path that became slow would never be measured.
         """
         packets = self._packets
@@ -172,7 +172,7 @@ class SentPackets:
         return acknowledged, lost, newest
 
     def confirm_timed_out(self, largest: int, received: int) -> int:
-        """How many timed-out urgent packets this acknowledgement shows to be really lost."""
+        """How many timed-out urgent packets this acknowledgment shows to be really lost."""
         conclusive = largest - self.reorder_packets
         lost = 0
         while self._timed_out and self._timed_out[0] <= conclusive:
@@ -180,7 +180,7 @@ class SentPackets:
         return lost
 
     def abandon_all(self) -> list[Packet]:
-        """Declare everything in flight lost because the peer is unresponsive; a later acknowledgement may correct
+        """Declare everything in flight lost because the peer is unresponsive; a later acknowledgment may correct
         that."""
         lost = [packet for packet in self._packets if packet is not None]
         for number, packet in enumerate(self._packets, self.base):

@@ -50,7 +50,7 @@ class Bounds(NamedTuple):
     max_age_s: float | None = None
 
     def united(self, other: Bounds) -> Bounds:
-        """What satisfies both readers."""
+        """Bounds that satisfy both readers."""
         return Bounds(_larger(self.rate_hz, other.rate_hz), _larger(self.max_age_s, other.max_age_s))
 
 
@@ -62,7 +62,7 @@ def _larger(a: float | None, b: float | None) -> float | None:
 
 
 class Subscription(NamedTuple):
-    """What programs of a node read: a topic's name or a pattern as in fnmatch."""
+    """A subscription of a node's programs: a topic's name or a pattern as in fnmatch."""
 
     pattern: str
     bounds: Bounds = UNBOUNDED
@@ -74,7 +74,8 @@ class Subscription(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class SubscriptionTable:
-    """What a node's programs read; `everything`: more than fits, or not known. A higher generation is newer."""
+    """All subscriptions of a node's programs; `everything`: more than fits, or not known. A higher generation is
+    newer."""
 
     generation: int
     subscriptions: tuple[Subscription, ...] = ()

@@ -1,7 +1,7 @@
 """Subscriptions of this node's programs, and the peers that follow them.
 
-A peer that asked gets the table, and a new one after each change. What programs start to read is announced at once,
-what they stop reading after `LINGER_S`, since many of them come back. Nothing is announced in the first `STARTING_S`:
+A peer that asked gets the table, and a new one after each change. New subscriptions are announced at once, ended
+ones after `LINGER_S`, since many programs come back. Nothing is announced in the first `STARTING_S`:
 the programs of a restarted robot are still connecting, and until peers know the table they send everything.
 """
 
@@ -62,7 +62,7 @@ class OwnSubscriptions:
         self._refresh(now)
 
     def shown(self) -> tuple[Subscription, ...] | None:
-        """What is announced to peers; None: everything."""
+        """The subscriptions announced to peers; None: everything."""
         return self._shown
 
     def table(self) -> bytes:

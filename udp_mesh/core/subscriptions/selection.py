@@ -1,4 +1,4 @@
-"""Which messages are sent to a peer: those of topics that its programs read, no faster and no older than they want.
+"""Choose the messages to send to a peer: topics that its programs read, no faster and no older than they want.
 
 A message is admitted, dropped, or withheld to be admitted or dropped later (`take_due`):
 
@@ -93,7 +93,7 @@ class Selection:
         return self._unread_bytes + self._paced_bytes
 
     def saved(self, destination: Destination) -> SavedCounters:
-        """What this peer was not sent."""
+        """Messages that this peer was not sent."""
         return self._saved.get(destination) or SavedCounters()
 
     # Admitting
@@ -111,8 +111,8 @@ class Selection:
         return self._decide(None, self._wanted_by_any(peers, accepted.channel.name, now), accepted, now)
 
     def _wanted_by_any(self, peers: Iterable[Peer], topic: str, now: float) -> Bounds | None:
-        """What satisfies all peers. Asks one of those whose table is not known, and none if another wants everything:
-        to ask a whole team would cost more than many broadcasts."""
+        """Bounds that satisfy all peers. Asks one of those whose table is not known, and none if another wants
+        everything: to ask a whole team would cost more than many broadcasts."""
         unknown: list[tuple[Peer, Session]] = []
         bounds: Bounds | None = None
         known = False

@@ -25,7 +25,7 @@ class KnownTable:
         self._matchers: list[tuple[re.Pattern[str], Bounds]] | None = None
 
     def bounds(self, topic: str) -> Bounds | None:
-        """What the peer's programs want of a topic; None: nothing."""
+        """The bounds that the peer's programs want for a topic; None: they do not read it."""
         if self.table.everything:
             return UNBOUNDED
         try:

@@ -1,4 +1,4 @@
-"""Which messages of a sender's boot have been delivered here, over any link: their copies are dropped."""
+"""The messages of a sender's boot that were delivered here, over any link: further copies are dropped."""
 
 from __future__ import annotations
 

@@ -85,7 +85,7 @@ class ThinMessage:
 
 @dataclass(slots=True, eq=False)
 class LinkQueueEntry:
-    """What one link has to send of a message."""
+    """The parts of a message that one link has to send."""
 
     message: ThinMessage
     to_send: deque[int]

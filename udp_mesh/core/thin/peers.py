@@ -37,7 +37,7 @@ FORGET_S = 3600.0
 
 
 class Verdict(Enum):
-    """What became of a frame."""
+    """The result of opening a frame."""
 
     ACCEPTED = "accepted"
     UNPROVEN = "unproven"
@@ -113,7 +113,7 @@ class ThinPeer:
 
 @dataclass(slots=True)
 class Opened:
-    """What a frame turned out to be. `peer` and `items` are set if it could be opened."""
+    """A frame that was opened, or why it was not. `peer` and `items` are set if it could be opened."""
 
     verdict: Verdict
     peer: ThinPeer | None = None

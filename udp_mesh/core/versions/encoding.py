@@ -43,7 +43,7 @@ class Version(NamedTuple):
 
     @property
     def kept_bytes(self) -> int:
-        """What it takes to keep it."""
+        """The memory that it takes."""
         return len(self.payload) + ENTRY_BYTES
 
 

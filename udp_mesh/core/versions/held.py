@@ -1,7 +1,7 @@
 """The versions that a node holds for one sender's boot, so that the next ones may come as differences.
 
 Each topic keeps the few that were received or referred to last; all of them together stay below the limit of the peer
-and, with those of other peers, below that of the node. What is dropped costs one whole version later.
+and, with those of other peers, below that of the node. A dropped version costs one whole version later.
 """
 
 from __future__ import annotations

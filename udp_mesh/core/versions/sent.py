@@ -1,4 +1,4 @@
-"""Which versions the peers have, and what is yet to be encoded for them.
+"""The versions that peers have, and the messages still to be encoded for them.
 
 1. `PeerVersions.prepare` encodes a message that is next to be sent: at once, or, if it is large, in steps.
 2. `SentVersions.step` does one such step and returns a message that is ready; the first step of a large base is done
@@ -151,7 +151,7 @@ class PeerVersions:
 
     def on_best_effort_refused(self) -> None:
         """The peer could not decode a message that already ended, which only best-effort ones do: forget their bases.
-        Which message it was is not remembered."""
+        The message itself is not remembered."""
         for number, channel in self._channels.items():
             if not channel.topic.topic.reliable and self._node.base(self, number) is not None:
                 self.on_base_lost(channel.topic)

@@ -32,7 +32,7 @@ INITIAL_CWND = 10.0
 
 @dataclass(frozen=True, slots=True)
 class AckSample:
-    """What one acknowledgment tells a controller."""
+    """The information in one acknowledgment for a controller."""
 
     now: float
     acked: int

@@ -158,7 +158,7 @@ class Trial:
         return result
 
     def _capacity_bytes(self) -> float:
-        """What the link carries at best while it is measured."""
+        """The most that the link can carry while it is measured."""
         since, until = self._measured_from, self._ends_at
         chain = self._cell.chain
         if chain is not None:

@@ -104,7 +104,7 @@ def is_answered(team: Team, node: str, address: str) -> bool:
 def _unanswered_by_old_entries(team: Team, name: str) -> list[str]:
     """The neighbors whose entry of the node's radio is older than the node's own entries, and that get no echo reply.
 
-    An old entry that drops nothing is kept on purpose: without block acknowledgement it has no window to be outside of,
+    An old entry that drops nothing is kept on purpose: without block acknowledgment it has no window to be outside of,
     and to delete it could cut off the other direction.
     """
     mac = next(mac for mac, node in team.names().items() if node == name)

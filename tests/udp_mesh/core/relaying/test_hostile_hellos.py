@@ -8,7 +8,7 @@ from tests.udp_mesh.core.relaying.topologies import EVERY, KEY, chain, node, rel
 from udp_mesh.core.events import MessageDelivered
 from udp_mesh.core.interfaces import Datagram
 from udp_mesh.core.relaying.hop_channel import HopChannels
-from udp_mesh.core.relaying.relaying import MAX_NEIGHBOURS
+from udp_mesh.core.relaying.relaying import MAX_NEIGHBORS
 from udp_mesh.core.relaying.routes import MAX_OFFERS
 from udp_mesh.crypto import Key
 from udp_mesh.sim.topology import Topology
@@ -89,7 +89,7 @@ def test_invented_nodes_and_neighbors_are_bounded() -> None:
     topology = chain(4)
     topology.run(6)
     n2 = topology.nodes["n2"]
-    for number in range(2 * MAX_NEIGHBOURS):
+    for number in range(2 * MAX_NEIGHBORS):
         own = number.to_bytes(16, "big")
         invented = tuple(
             RelayedNode(bytes((1, entry)) + own[2:], 1, 1, 1, 1500, True, f"m{number}-{entry}", ())
@@ -97,7 +97,7 @@ def test_invented_nodes_and_neighbors_are_bounded() -> None:
         )
         n2.receive(hello(own, invented), "n1", MALLORY, topology.now)
     routes = n2._relaying.routes
-    assert len(n2._relaying.neighbours) <= MAX_NEIGHBOURS
+    assert len(n2._relaying.neighbors) <= MAX_NEIGHBORS
     assert routes._count <= MAX_OFFERS
     # None of them answers, so none is used or becomes a peer.
     assert {route.name for route in routes.selected.values()} == {"n1", "n3", "n4"}

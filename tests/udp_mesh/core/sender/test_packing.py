@@ -134,8 +134,8 @@ def test_a_stream_requests_fewer_acknowledgements_than_it_has_datagrams() -> Non
     before = world.nodes["b"].conditions(world.now).counters.acknowledgements_sent
     world.stream("pose", 2000, 0.0005)
     world.run(1.5)
-    acknowledgements = world.nodes["b"].conditions(world.now).counters.acknowledgements_sent - before
-    assert acknowledgements <= 0.6 * len(world.sent)
+    acknowledgments = world.nodes["b"].conditions(world.now).counters.acknowledgements_sent - before
+    assert acknowledgments <= 0.6 * len(world.sent)
 
 
 def test_a_peer_of_an_earlier_version_gets_long_heads(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,4 +1,4 @@
-"""Small urgent fragments are sent again: soon on a lossy path, and whenever their acknowledgement is overdue."""
+"""Small urgent fragments are sent again: soon on a lossy path, and whenever their acknowledgment is overdue."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How many packets may be sent: while acknowledgements are late the link is assumed to keep delivering, for a bounded
+"""How many packets may be sent: while acknowledgments are late the link is assumed to keep delivering, for a bounded
 time."""
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from udp_mesh.core.settings import Settings
 
 
 def busy_outbound(**link: object) -> tuple[Sender, float]:
-    """A sender that has filled its link for a while, and the time of its last acknowledgement."""
+    """A sender that has filled its link for a while, and the time of its last acknowledgment."""
     run = Run(urgent=False)
     run.link(**link)
     run.start()

@@ -1,4 +1,4 @@
-"""Fragments whose acknowledgements stay away are sent again, whatever the scheduler held when they timed out."""
+"""Fragments whose acknowledgments stay away are sent again, whatever the scheduler held when they timed out."""
 
 from __future__ import annotations
 

@@ -78,8 +78,8 @@ def test_a_flood_of_questions_gets_one_answer_a_second() -> None:
         world.run(0.01)
         table_datagrams.append(world.now)
     flooded = world.pipes["a", "b"].carried_bytes - before - one_table
-    acknowledgements = 1000 * 100
-    assert flooded < 12 * one_table + acknowledgements
+    acknowledgments = 1000 * 100
+    assert flooded < 12 * one_table + acknowledgments
 
 
 def test_a_program_that_subscribes_in_a_loop_costs_a_few_tables_a_second() -> None:

@@ -1,4 +1,4 @@
-"""From the tables of radios to a look of the placement meter, and the command on a fleet whose robot moves."""
+"""From the tables of radios to a snapshot of the placement meter, and the command on a fleet whose robot moves."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import pytest
 from meshctl.device.framing import quoted
 from meshctl.device.link_table import LinkTable, links_script, parse_links
 from meshctl.device.parse.sections import split_sections
-from meshctl.nodes.link_looks import HopMargins, MeshTables, assemble, path_beyond
-from meshctl.placement.meter import LinkLook, PathBeyond
+from meshctl.nodes.link_snapshots import HopMargins, MeshTables, assemble, path_beyond
+from meshctl.placement.meter import PathBeyond, RelayLink
 from meshctl.robots.local_daemon import DaemonError, LocalDaemon
 
 MACS = {name: f"02:00:00:00:00:{index:02x}" for index, name in enumerate(("base", "b01", "b02", "spot1"), 1)}
@@ -85,12 +85,12 @@ def test_a_look_has_both_directions_and_the_hops_behind() -> None:
         base=table(9.0, b01=-66),
         b02=table(9.0, "spot1", spot1=-81),
     )
-    look = assemble(seen, HopMargins(7.0), 10.0, fresh=True, beacons=2)
-    assert look.links == (LinkLook("b01", -70, -95, -74, -95), LinkLook("b02", -80, -95, -81, -95))
-    assert look.next_hop == "b01"
+    snapshot = assemble(seen, HopMargins(7.0), 10.0, fresh=True, beacons=2)
+    assert snapshot.links == (RelayLink("b01", -70, -95, -74, -95), RelayLink("b02", -80, -95, -81, -95))
+    assert snapshot.next_hop == "b01"
     # b02 reaches the base through the robot alone: no relay for it
-    assert set(look.paths) == {"b01"}
-    assert look.paths["b01"] == PathBeyond(1, 29.0 - 7.0 - 10.0, 29.0)
+    assert set(snapshot.paths) == {"b01"}
+    assert snapshot.paths["b01"] == PathBeyond(1, 29.0 - 7.0 - 10.0, 29.0)
     # the same table gives no second sample
     assert assemble(seen, HopMargins(7.0), 11.0, fresh=False).links == ()
 

@@ -1,8 +1,8 @@
-"""The links of one robot for the placement meter: a look a second, over kept connections.
+"""The links of one robot for the placement meter: a snapshot a second, over kept connections.
 
-Each look asks the robot's own radios, and in turn one of the nodes that it hears or that its path uses, for the other
-direction and the hops behind. Radios are asked in threads: one that does not answer delays no look, and counts as
-silent. `assemble` is pure: tables -> `Look`.
+`LinkPoller` queries the robot's own radios, and in turn one of the nodes that it hears or that its path uses, for the
+other direction and the hops behind. Radios are queried in threads: one that does not answer delays no snapshot, and
+counts as silent. `assemble` (pure) makes a `LinkSnapshot` of their tables.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from meshctl.placement.margin import (
     filtered_snr_db,
     worse_snr_db,
 )
-from meshctl.placement.meter import LinkLook, Look, PathBeyond, Position
+from meshctl.placement.meter import LinkSnapshot, PathBeyond, Position, RelayLink
 
 QUERY_S = 3.0
 MAX_TABLE_AGE_S = 30.0
@@ -85,8 +85,8 @@ def assemble(
     heading_rad: float | None = None,
     beacons: int | None = None,
     spacing_m: float | None = None,
-) -> Look:
-    """One look. `fresh`: the robot's table is newer than the one of the last look; an old one has no new samples."""
+) -> LinkSnapshot:
+    """`fresh`: the robot's table is newer than that of the last snapshot; an old one has no new samples."""
     links, paths, next_hop = [], {}, ""
     heard = {
         name: found
@@ -95,7 +95,7 @@ def assemble(
     }
     for name, (dbm, noise_dbm) in heard.items():
         back = max((reading for own in mesh.own if (reading := signal_of(mesh, name, own))), default=(None, None))
-        links.append(LinkLook(name, dbm, noise_dbm, *back))
+        links.append(RelayLink(name, dbm, noise_dbm, *back))
         beyond = path_beyond(mesh, margins, name)
         if beyond is not None:
             paths[name] = beyond
@@ -103,7 +103,7 @@ def assemble(
         table = mesh.tables.get(own)
         if table is not None and table.next_hop:
             next_hop = mesh.names.get(table.next_hop, "")
-    return Look(
+    return LinkSnapshot(
         now_s,
         tuple(links) if fresh else (),
         paths,
@@ -125,7 +125,7 @@ def _heard(mesh: MeshTables, name: str) -> tuple[int, int | None] | None:
 
 def path_beyond(mesh: MeshTables, margins: HopMargins, relay: str) -> PathBeyond | None:
     """The way from a relay to the base by the nodes' own next hops; None if it has none, or if it leads through the
-    robot itself. Of a relay that has not been asked yet, only that it is one hop at least."""
+    robot itself. For a relay that has not been queried yet, one hop at least."""
     found: list[tuple[float, float]] = []
     node, hops = relay, 0
 
@@ -149,8 +149,8 @@ def path_beyond(mesh: MeshTables, margins: HopMargins, relay: str) -> PathBeyond
 
 
 @dataclass(slots=True)
-class LinkWatch:
-    """Asks the radios in threads and keeps their newest tables. Thread-safe; `close` ends the threads' work."""
+class LinkPoller:
+    """Queries the radios in threads and keeps their newest tables. Thread-safe; `close` ends the threads' work."""
 
     fleet: Fleet
     access: ConnectionPool

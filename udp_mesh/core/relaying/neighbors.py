@@ -26,7 +26,7 @@ MAX_LINK_COST = 16 * 64
 SUSPECT_COST = 16 * LINK_COST
 """Added while what is sent to a neighbor is not acknowledged: another route is better, but none is worse."""
 ACK_EVERY = 8
-"""Carried datagrams per acknowledgement of a hop."""
+"""Carried datagrams per acknowledgment of a hop."""
 ACK_DELAY_S = 0.008
 _HISTORY = (1 << HISTORY_ROUNDS) - 1
 
@@ -73,13 +73,13 @@ class HopLink:
         )
 
     def cost(self, interval_s: float, now: float) -> int:
-        """Expected transmissions of a datagram and its acknowledgement (ETX), in sixteenths."""
+        """Expected transmissions of a datagram and its acknowledgment (ETX), in sixteenths."""
         both = self.quality(interval_s, now) * self.reported / 255
         return min(MAX_LINK_COST, round(LINK_COST / both)) if both > LINK_COST / MAX_LINK_COST else MAX_LINK_COST
 
 
 @dataclass(eq=False, slots=True)
-class HopNeighbour:
+class HopNeighbor:
     """One boot of a node that is heard directly."""
 
     hop: Hop
@@ -94,7 +94,7 @@ class HopNeighbour:
     links: dict[str, HopLink] = field(default_factory=dict)
     window: HopWindow = field(default_factory=HopWindow)
     unacknowledged: int = 0
-    """Carried datagrams since our last acknowledgement."""
+    """Carried datagrams since our last acknowledgment."""
     largest: int = -1
     largest_at: float = 0.0
     ack_at: float = float("inf")
@@ -130,33 +130,33 @@ class HopNeighbour:
         self.ack_at = now if self.unacknowledged >= ACK_EVERY else min(self.ack_at, now + ACK_DELAY_S)
 
 
-def make_neighbour(hop: Hop, budget: QueueBudget) -> HopNeighbour:
-    return HopNeighbour(hop, HopQueue(budget))
+def make_neighbor(hop: Hop, budget: QueueBudget) -> HopNeighbor:
+    return HopNeighbor(hop, HopQueue(budget))
 
 
 def on_hello(
-    neighbour: HopNeighbour, hello: RelayHello, own_tag: bytes, link: str, address: Address, mtu: int, now: float
+    neighbor: HopNeighbor, hello: RelayHello, own_tag: bytes, link: str, address: Address, mtu: int, now: float
 ) -> HopLink:
     """Record what a hello says about its sender and about the link it came on."""
-    neighbour.name, neighbour.relays, neighbour.proofs = hello.name, hello.relays, hello.proofs
-    neighbour.interval_s = hello.interval_ms / 1000
-    neighbour.round = max(neighbour.round, hello.round)
-    hop_link = neighbour.links.get(link)
+    neighbor.name, neighbor.relays, neighbor.proofs = hello.name, hello.relays, hello.proofs
+    neighbor.interval_s = hello.interval_ms / 1000
+    neighbor.round = max(neighbor.round, hello.round)
+    hop_link = neighbor.links.get(link)
     if hop_link is None:
-        hop_link = neighbour.links[link] = HopLink(link, address, mtu)
+        hop_link = neighbor.links[link] = HopLink(link, address, mtu)
     hop_link.address, hop_link.mtu = address, mtu
     hop_link.on_hello(hello.round, now)
     for heard in hello.heard:
         if heard.tag == own_tag:
             if heard.round > hop_link.echo:
                 # It hears us (again).
-                neighbour.window.timeouts = 0
-            neighbour.passes_us = heard.passes
+                neighbor.window.timeouts = 0
+            neighbor.passes_us = heard.passes
             hop_link.echo, hop_link.reported, hop_link.reported_at = heard.round, heard.quality, now
     return hop_link
 
 
-def heard_on(link: HopLink, neighbour: HopNeighbour, *, passes: bool, now: float) -> HeardHop:
-    """What we tell a neighbor about its hellos on a link."""
-    quality = round(255 * link.quality(neighbour.interval_s, now))
-    return HeardHop(neighbour.tag, max(0, link.round), quality, passes)
+def heard_on(link: HopLink, neighbor: HopNeighbor, *, passes: bool, now: float) -> HeardHop:
+    """Our report to a neighbor about its hellos on a link."""
+    quality = round(255 * link.quality(neighbor.interval_s, now))
+    return HeardHop(neighbor.tag, max(0, link.round), quality, passes)
