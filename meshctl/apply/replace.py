@@ -187,14 +187,14 @@ def identity_edits(
 
     A MAC is written only where the inventory has one: a fleet may identify its nodes by label.
     """
-    mine: dict[str, str] = {}
+    node_edits: dict[str, str] = {}
     label_mac = observation.board.label_mac if observation.board is not None else ""
     mac = (spare.mac if spare is not None else "") or label_mac
     if mac and (old.mac or (spare is not None and spare.mac)):
-        mine["mac"] = mac
+        node_edits["mac"] = mac
     if spare is not None:
-        mine.update({key: value for key, value in (("serial", spare.serial), ("label", spare.label)) if value})
+        node_edits.update({key: value for key, value in (("serial", spare.serial), ("label", spare.label)) if value})
     if state_after(old) is not old.state:
-        mine["state"] = state_after(old).value
-    theirs = {"state": NodeState.RETIRED.value} if spare is not None else {}
-    return mine, theirs
+        node_edits["state"] = state_after(old).value
+    spare_edits = {"state": NodeState.RETIRED.value} if spare is not None else {}
+    return node_edits, spare_edits

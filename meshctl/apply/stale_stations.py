@@ -70,7 +70,7 @@ class StationEntry:
 
 def radio_macs(observation: Observation, radios: Radios) -> tuple[str, ...]:
     """The lower-case MACs by which neighbors know these radios of a node."""
-    if radios.every:
+    if radios.is_all:
         return mesh_macs(observation)
     links = {link.ifname: link.mac.lower() for link in observation.links or ()}
     macs = {ifname: mac.lower() for ifname, mac in (observation.macs or {}).items()} | links

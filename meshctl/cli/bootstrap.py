@@ -344,15 +344,15 @@ def _record_identity(
 ) -> Changes:
     """Write the new identity to the inventory. Raises InputError with the edits to make by hand if that fails."""
     found = successor.discovered.found[node.name]
-    mine, theirs = identity_edits(node, spare, found.observation)
+    node_edits, spare_edits = identity_edits(node, spare, found.observation)
     if dry_run:
-        return _identity_changes(inventory, node, spare, found, mine, theirs)
+        return _identity_changes(inventory, node, spare, found, node_edits, spare_edits)
     opened.trust.replace(node.name, found.key)
     try:
-        changes = _identity_changes(inventory, node, spare, found, mine, theirs)
+        changes = _identity_changes(inventory, node, spare, found, node_edits, spare_edits)
         save(changes)
     except MeshctlError as error:
-        both = {node.name: dict(mine), **({spare.name: dict(theirs)} if spare is not None else {})}
+        both = {node.name: dict(node_edits), **({spare.name: dict(spare_edits)} if spare is not None else {})}
         edits = {name: edit for name, edit in both.items() if edit}
         raise InputError(
             f"{node.name} runs on its new device, but the inventory could not be updated: {error}",
@@ -368,13 +368,13 @@ def _identity_changes(
     node: Node,
     spare: Node | None,
     found: FoundDevice,
-    mine: Mapping[str, Any],
-    theirs: Mapping[str, Any],
+    node_edits: Mapping[str, Any],
+    spare_edits: Mapping[str, Any],
 ) -> Changes:
     editor = Editor.open(inventory, environ=os.environ)
     # the spare's entry first: two nodes must not share a MAC
     if spare is not None:
-        set_node(editor, spare.name, dict(theirs))
+        set_node(editor, spare.name, dict(spare_edits))
         for word in ("mac", "serial", "label"):
             if editor.has(("nodes", spare.name, word)):
                 editor.remove(("nodes", spare.name, word))
@@ -382,8 +382,8 @@ def _identity_changes(
     for radio in node.radios:
         if editor.has(("nodes", node.name, "radios", radio.name, "mac")):
             editor.remove(("nodes", node.name, "radios", radio.name, "mac"))
-    if mine:
-        set_node(editor, node.name, dict(mine))
+    if node_edits:
+        set_node(editor, node.name, dict(node_edits))
     if node.host_keys:
         set_node(editor, node.name, {"host_keys": [found.key.text]})
     return editor.changes()

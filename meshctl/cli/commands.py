@@ -41,7 +41,7 @@ COMMANDS: dict[str, Entry] = {
     "apply": Entry("meshctl.cli.plan", "apply", "Apply a saved plan", _CHANGE),
     "provision": Entry("meshctl.cli.plan", "provision", "Plan, confirm and apply changes", _CHANGE),
     "resume": Entry("meshctl.cli.plan", "resume", "Resume an interrupted run", _CHANGE),
-    "rollback": Entry("meshctl.cli.rollback", "rollback", "Roll nodes back to before a run", _CHANGE),
+    "rollback": Entry("meshctl.cli.rollback", "rollback", "Undo the configuration changes of a run", _CHANGE),
     "history": Entry("meshctl.cli.history", "history", "Show past runs, their steps and outcomes", _CHANGE),
     "bootstrap": Entry("meshctl.cli.bootstrap", "bootstrap", "Set up factory-default devices", _CHANGE),
     "replace": Entry("meshctl.cli.bootstrap", "replace", "Replace a failed node with a spare", _CHANGE),

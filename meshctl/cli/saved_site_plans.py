@@ -65,20 +65,20 @@ def load_site_plans(text: str, file: str) -> SavedSitePlans | None:
     check_version(document, FORMAT_VERSION, "plans", file)
     try:
         direct, sites = document["direct"], dict(document["sites"])
-        missing = {name: _unplanned(said) for name, said in sites.items() if "error" in said}
-        planned = {name: said for name, said in sites.items() if name not in missing}
+        missing = {name: _unplanned(entry) for name, entry in sites.items() if "error" in entry}
+        planned = {name: entry for name, entry in sites.items() if name not in missing}
         return SavedSitePlans(
             str(document["fleet"]),
             None if direct is None else from_document(direct, file),
-            {name: from_document(said, f"{file}, site {name}") for name, said in planned.items()},
+            {name: from_document(entry, f"{file}, site {name}") for name, entry in planned.items()},
             missing,
         )
     except (KeyError, TypeError, ValueError) as error:
         raise damaged(file, error) from error
 
 
-def _unplanned(said: Mapping[str, Any]) -> Unplanned:
-    return Unplanned(tuple(map(str, said["nodes"])), str(said["error"]))
+def _unplanned(entry: Mapping[str, Any]) -> Unplanned:
+    return Unplanned(tuple(map(str, entry["nodes"])), str(entry["error"]))
 
 
 def check_fleet(planned: str, fleet: Fleet, file: str) -> None:

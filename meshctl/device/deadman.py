@@ -332,9 +332,9 @@ HINTS = {
 
 
 def _unreadable(connection: Connection, verb: str, done: Completed) -> CommandFailed:
-    said = (done.stderr or done.stdout).strip() or "nothing"
+    answer = (done.stderr or done.stdout).strip() or "nothing"
     return CommandFailed(
-        f"{connection.endpoint.label}: the dead-man's switch answered {verb} with {said!r}",
+        f"{connection.endpoint.label}: the dead-man's switch answered {verb} with {answer!r}",
         exit_status=done.exit_status,
         stderr=done.stderr,
         hint=f"is {PROGRAM} installed? `meshctl provision` installs it",

@@ -150,13 +150,13 @@ def check_firmware(connection: Connection, image_path: str) -> FirmwareCheck:
     )
     done = connection.run(script, timeout_s=FIRMWARE_TEST_TIMEOUT_S)
     lines = done.check(f"{connection.endpoint.label}: test the firmware").stdout.splitlines()
-    said = [_STAMP.sub("", line[5:]).strip().rstrip(".") for line in lines if line.startswith("said ")]
+    output = [_STAMP.sub("", line[5:]).strip().rstrip(".") for line in lines if line.startswith("said ")]
     validation = mapping(parse_json(next((line[5:] for line in lines if line.startswith("json ")), "")))
     memory = parse_meminfo(done.stdout)
     # procd rejects `-f` for such an image only after `sysupgrade` has started; -T does not check it
     bare = validation.get("allow_backup") is False
     passed = "status 0" in lines and (not validation or boolean(validation.get("valid"))) and not bare
-    reason = "; ".join(line for line in said if line and not line.startswith(_FORCE_ADVICE)) or "sysupgrade -T failed"
+    reason = "; ".join(line for line in output if line and not line.startswith(_FORCE_ADVICE)) or "sysupgrade -T failed"
     if bare:
         reason = "it does not accept a configuration from the running system"
     return FirmwareCheck(
@@ -201,8 +201,8 @@ def upgrade_state(connection: Connection) -> tuple[Upgrade, str]:
         "tail -n 3 /tmp/sysupgrade.log 2>/dev/null"
     )
     done = connection.run(script, timeout_s=UPGRADE_STATE_TIMEOUT_S)
-    state, *said = done.stdout.splitlines() or [Upgrade.RUNNING.value]
-    lines = (_STAMP.sub("", line).strip() for line in said)
+    state, *output = done.stdout.splitlines() or [Upgrade.RUNNING.value]
+    lines = (_STAMP.sub("", line).strip() for line in output)
     return Upgrade(state), "; ".join(line for line in lines if line)
 
 

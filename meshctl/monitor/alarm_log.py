@@ -53,7 +53,7 @@ class LoggedAlarm:
     silenced: Silence | None = None
     peak: str = ""
     """The highest level it has had, as far as this process knows; empty if it was read from a file."""
-    rose: bool = False
+    has_risen: bool = False
     """It rose above its peak: an acknowledgment of the lower level does not cover it."""
 
     @property
@@ -160,11 +160,13 @@ def advance(
             known = LoggedAlarm(device, code, level, text, hint, first_s=now_s, last_s=now_s, peak=level)
             began.append(known)
         peak = known.peak or known.level
-        rose = LEVELS.index(level) > LEVELS.index(peak)
-        if rose:
+        has_risen = LEVELS.index(level) > LEVELS.index(peak)
+        if has_risen:
             began.append(known)
             peak = level
-        after[device, code] = replace(known, level=level, text=text, hint=hint, last_s=now_s, peak=peak, rose=rose)
+        after[device, code] = replace(
+            known, level=level, text=text, hint=hint, last_s=now_s, peak=peak, has_risen=has_risen
+        )
     ended_now = []
     for key, alarm in open_alarms.items():
         if key in after:

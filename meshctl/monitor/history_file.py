@@ -79,7 +79,7 @@ def row_of(alarm: LoggedAlarm) -> tuple[object, ...]:
     ended = None if alarm.ended_s is None else milliseconds(alarm.ended_s)
     return (
         *(alarm.device, alarm.code, milliseconds(alarm.first_s), milliseconds(alarm.last_s), ended),
-        *(alarm.level, alarm.text, alarm.hint, int(alarm.rose)),
+        *(alarm.level, alarm.text, alarm.hint, int(alarm.has_risen)),
     )
 
 

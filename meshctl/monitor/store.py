@@ -189,7 +189,9 @@ class FrameStore:
         for alarm in (*change.open.values(), *change.ended):
             key = (alarm.device, alarm.code, alarm.first_s)
             unwritten = self._pending.get(key)
-            self._pending[key] = replace(alarm, rose=True) if unwritten is not None and unwritten.rose else alarm
+            self._pending[key] = (
+                replace(alarm, has_risen=True) if unwritten is not None and unwritten.has_risen else alarm
+            )
 
     def _write(self, frame: Frame, key: int, alarms: Mapping[Any, LoggedAlarm]) -> None:
         packed = zlib.compress(frame.json_text.encode(), _ZLIB_LEVEL)

@@ -22,17 +22,17 @@ class Radios:
     """The radios with these interfaces, or all radios of the node."""
 
     ifnames: frozenset[str] = frozenset()
-    every: bool = False
+    is_all: bool = False
 
     def __contains__(self, ifname: object) -> bool:
-        return self.every or ifname in self.ifnames
+        return self.is_all or ifname in self.ifnames
 
     def __bool__(self) -> bool:
-        return self.every or bool(self.ifnames)
+        return self.is_all or bool(self.ifnames)
 
 
 NO_RADIOS = Radios()
-EVERY_RADIO = Radios(every=True)
+EVERY_RADIO = Radios(is_all=True)
 
 
 def restarting_radios(before: Package | None, after: Package | None) -> Radios:
@@ -152,7 +152,7 @@ def observed_restarts(before: Observation, now: Observation, seconds: float) -> 
     old, new = before.ifindexes or {}, now.ifindexes or {}
     created = frozenset(name for name in old.keys() & new.keys() if old[name] != new[name])
     recent = started_within(now, seconds)
-    return EVERY_RADIO if recent.every else Radios(created | recent.ifnames)
+    return EVERY_RADIO if recent.is_all else Radios(created | recent.ifnames)
 
 
 def started_within(observation: Observation, seconds: float) -> Radios:

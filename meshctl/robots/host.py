@@ -98,8 +98,8 @@ class BannerFilter(Connection):
         return self._inner.endpoint
 
     def run(self, script: str, *, stdin: bytes | Iterable[bytes] = b"", timeout_s: float | None = None) -> Completed:
-        said = quoted("echo", _OUTPUT_MARKER)
-        done = self._inner.run(f"{said}; {said} >&2\n{script}", stdin=stdin, timeout_s=timeout_s)
+        print_marker = quoted("echo", _OUTPUT_MARKER)
+        done = self._inner.run(f"{print_marker}; {print_marker} >&2\n{script}", stdin=stdin, timeout_s=timeout_s)
         return replace(
             done, stdout_bytes=_without_banner(done.stdout_bytes), stderr_bytes=_without_banner(done.stderr_bytes)
         )
@@ -108,9 +108,9 @@ class BannerFilter(Connection):
         self._inner.close()
 
 
-def _without_banner(said: bytes) -> bytes:
+def _without_banner(output: bytes) -> bytes:
     """The output after the marker line; all of it if the script did not start, since that is the error."""
-    before, line, after = said.partition(f"{_OUTPUT_MARKER}\n".encode())
+    before, line, after = output.partition(f"{_OUTPUT_MARKER}\n".encode())
     return after if line else before
 
 

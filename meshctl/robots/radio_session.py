@@ -150,8 +150,8 @@ class RadioSession:
     def _reason(self, otherwise: str) -> str:
         """The last line of ssh's error output, or this text."""
         process = self._process
-        said = process.stderr.read() if process is not None and process.stderr is not None else None
-        lines = [line.strip() for line in (said or b"").decode("utf-8", "replace").splitlines()]
+        error_output = process.stderr.read() if process is not None and process.stderr is not None else None
+        lines = [line.strip() for line in (error_output or b"").decode("utf-8", "replace").splitlines()]
         return next((line for line in reversed(lines) if line), otherwise)
 
     def _end(self) -> None:

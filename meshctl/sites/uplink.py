@@ -122,7 +122,7 @@ class Uplink(ABC):
     ) -> tuple[str, dict[str, Any]]:
         """The plan that the worker made, or what still applies of the saved plan `agreed`, as JSON; and node -> what it
         would replace there. `images` are paths in the part with the SHA-256 of their content."""
-        said = self.ask(
+        reply = self.ask(
             {
                 "do": "plan",
                 "run": run,
@@ -133,7 +133,7 @@ class Uplink(ABC):
                 "agreed": agreed,
             }
         )
-        return str(said["plan"]), dict(said["replaced"])
+        return str(reply["plan"]), dict(reply["replaced"])
 
     def status(self, run: str, part: bytes, nodes: Sequence[str], options: Sequence[str]) -> str:
         """The status of the site's nodes, as `meshctl status --json` prints it there."""
@@ -154,17 +154,17 @@ class Uplink(ABC):
         self.close()
 
 
-def greeting_of(said: Mapping[str, Any], site: str) -> Greeting:
+def greeting_of(reply: Mapping[str, Any], site: str) -> Greeting:
     """The answer to `hello`. Raises InputError for a worker of another version."""
-    if said.get("protocol") != PROTOCOL or said.get("meshctl") != __version__:
+    if reply.get("protocol") != PROTOCOL or reply.get("meshctl") != __version__:
         raise InputError(
-            f"site {site}: its worker is meshctl {said.get('meshctl')}, here is {__version__}",
+            f"site {site}: its worker runs meshctl {reply.get('meshctl')}, this computer {__version__}",
             hint=f"run `meshctl sites install {site}`",
         )
     runs = (
         RemoteRun(
             str(each["run"]), str(each["state"]), str(each["operator"]), str(each["command"]), float(each["began_s"])
         )
-        for each in said["runs"]
+        for each in reply["runs"]
     )
-    return Greeting(str(said["meshctl"]), str(said["directory"]), tuple(map(str, said["operators"])), tuple(runs))
+    return Greeting(str(reply["meshctl"]), str(reply["directory"]), tuple(map(str, reply["operators"])), tuple(runs))

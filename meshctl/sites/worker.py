@@ -267,9 +267,9 @@ def _file_name(text: object) -> str:
 
 def _failure(done: subprocess.CompletedProcess[bytes]) -> WorkerError:
     """The last output of a failed command, as its error."""
-    said = done.stderr.decode("utf-8", "replace").strip().splitlines()
-    errors = [line.removeprefix("error: ") for line in said if not line.startswith("hint: ")][:_MAX_ERROR_LINES]
-    hints = [line.removeprefix("hint: ") for line in said if line.startswith("hint: ")]
+    error_lines = done.stderr.decode("utf-8", "replace").strip().splitlines()
+    errors = [line.removeprefix("error: ") for line in error_lines if not line.startswith("hint: ")][:_MAX_ERROR_LINES]
+    hints = [line.removeprefix("hint: ") for line in error_lines if line.startswith("hint: ")]
     text = "\n".join(errors) or f"the command exited with {done.returncode} and printed nothing"
     return WorkerError(text, hint=hints[-1] if hints else "")
 

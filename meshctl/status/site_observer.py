@@ -38,8 +38,8 @@ def answers_json(
     answers: Mapping[str, RawObservation | NoAnswer], now_s: float, sent: Mapping[str, int]
 ) -> dict[str, object]:
     """Answers as JSON; `now_s` by the clock that the answers' times are of, `sent` the bytes to and from each node."""
-    said = {name: _as_object(answer) for name, answer in answers.items()}
-    return {"now_s": now_s, "answers": said, "sent_bytes": dict(sent)}
+    encoded = {name: _as_object(answer) for name, answer in answers.items()}
+    return {"now_s": now_s, "answers": encoded, "sent_bytes": dict(sent)}
 
 
 def _as_object(answer: RawObservation | NoAnswer) -> dict[str, object]:
@@ -66,21 +66,21 @@ def parse_answers(text: str, now_s: float) -> SiteAnswers:
     try:
         document = json.loads(text)
         ahead_s = float(document["now_s"]) - now_s
-        answers = {str(name): _parsed(said, ahead_s) for name, said in document["answers"].items()}
+        answers = {str(name): _parsed(answer, ahead_s) for name, answer in document["answers"].items()}
         return SiteAnswers(answers, {str(name): int(count) for name, count in document["sent_bytes"].items()})
     except (AttributeError, KeyError, TypeError, zlib.error) as error:
         raise ValueError(f"not the answers of nodes: {type(error).__name__}: {error}") from error
 
 
-def _parsed(said: Mapping[str, Any], ahead_s: float) -> Observation | NoAnswer:
-    if "output" not in said:
-        return NoAnswer(str(said["reason"]), str(said["code"]), str(said["hint"]))
+def _parsed(answer: Mapping[str, Any], ahead_s: float) -> Observation | NoAnswer:
+    if "output" not in answer:
+        return NoAnswer(str(answer["reason"]), str(answer["code"]), str(answer["hint"]))
     unpack = zlib.decompressobj()
-    output = unpack.decompress(base64.b64decode(str(said["output"]), validate=True), MAX_OUTPUT_BYTES)
+    output = unpack.decompress(base64.b64decode(str(answer["output"]), validate=True), MAX_OUTPUT_BYTES)
     if unpack.unconsumed_tail:
         raise ValueError(f"an answer of more than {MAX_OUTPUT_BYTES >> 20} MiB")
-    asked_at_s, answered_at_s = (float(said[name]) - ahead_s for name in ("asked_at_s", "answered_at_s"))
-    return RawObservation(str(said["nonce"]), output, asked_at_s, answered_at_s).interpret()
+    asked_at_s, answered_at_s = (float(answer[name]) - ahead_s for name in ("asked_at_s", "answered_at_s"))
+    return RawObservation(str(answer["nonce"]), output, asked_at_s, answered_at_s).interpret()
 
 
 @dataclass(frozen=True, slots=True)

@@ -137,14 +137,14 @@ def main(arguments: Optional[Sequence[str]] = None) -> int:
     parser.add_argument("--margin", type=float, metavar="DB", help="turn below this radio margin, where it is known")
     parser.add_argument("--socket", default=DEFAULT_SOCKET, help="the daemon's socket (default: %(default)s)")
     given = parser.parse_args(arguments)
-    said: Optional[bool] = None
+    last: Optional[bool] = None
     try:
         with MeshClient(given.socket) as mesh:
             need = Need(given.bits_per_s, given.priority, given.reserve, given.margin)
             for decision in decisions(mesh, given.peer, need):
-                if decision.turn_back != said:
-                    said = decision.turn_back
-                    sys.stdout.write("{}: {}\n".format("turn-back" if said else "go", decision.reason))
+                if decision.turn_back != last:
+                    last = decision.turn_back
+                    sys.stdout.write("{}: {}\n".format("turn-back" if last else "go", decision.reason))
                     sys.stdout.flush()
     except MeshError as error:
         sys.stderr.write("turn_back: {}\n".format(error))

@@ -64,7 +64,7 @@ class _Level:
         self.fresh_bytes = sum(len(message.body) + SMALL_OVERHEAD_BYTES for message in self.fresh)
         self.purge_at = max(MIN_PURGE_MESSAGES, 2 * len(self.fresh))
 
-    def empty(self) -> bool:
+    def is_empty(self) -> bool:
         return not (self.retransmit or self.fresh or self.stale_retransmits or self.stale_fresh)
 
 
@@ -118,7 +118,7 @@ class Scheduler:
 
     def is_idle(self, priority: int) -> bool:
         """Whether every level is empty. The bit of `priority`, the level just consumed from, may not be cleared yet."""
-        return not self.waiting & ~(1 << priority) and self._levels[priority].empty()
+        return not self.waiting & ~(1 << priority) and self._levels[priority].is_empty()
 
     def peek(self, priority: int) -> Run | None:
         """The fragments to send next on this level. None, with the level's bit cleared, if it is empty."""
