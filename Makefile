@@ -18,7 +18,8 @@ demo: setup
 # Six workers on two cores: tests of virtual fleets and of real radios wait for most of their time.
 test: setup
 	$(BIN)/python -m compileall -q meshctl meshlab mesh_sweep udp_mesh
-	env -u PYTHONDONTWRITEBYTECODE $(BIN)/pytest -n 6 --dist loadgroup --no-loadscope-reorder
+	scripts/with-test-directory env -u PYTHONDONTWRITEBYTECODE \
+		$(BIN)/pytest -n 6 --dist loadgroup --no-loadscope-reorder
 
 check: setup
 	$(BIN)/ruff check .
