@@ -87,7 +87,7 @@ def _above(reason: yaml.MarkedYAMLError) -> str:
 
 
 def _mistake(lines: Sequence[str], reason: yaml.MarkedYAMLError, quote: yaml.ScalarEvent | None) -> _Mistake | None:
-    """The mistake, if it is one that can be told from the lines."""
+    """The mistake, if the lines show what it is."""
     problem, mark, begin = reason.problem or "", reason.problem_mark, reason.context_mark
     if mark is None or mark.line > len(lines):
         return None

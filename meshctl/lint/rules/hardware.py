@@ -326,8 +326,7 @@ def target_unknown(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for profile in fleet.hardware.values():
         target, _, subtarget = profile.target.partition("/")
         path = ("hardware", profile.name, "target")
-        # MC826 reports a target without a subtarget
-        # releases add targets: report only names similar to a known one
+        # releases add targets: report only names similar to a known one (and MC826 a target without a subtarget)
         if target not in TARGETS and subtarget:
             if hint := suggest(TARGETS, target)[1]:
                 yield Finding(path, "unknown target", "a target of OpenWrt", profile.target, hint)
@@ -335,7 +334,8 @@ def target_unknown(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
             expected = f"{SUCCESSORS[target]}/{subtarget}"
             yield Finding(path, f"OpenWrt {profile.release} has no {target}", expected, profile.target)
         elif target in SUBTARGETS and subtarget not in SUBTARGETS[target]:
-            if near := [f"{target}/{known}" for known in nearest(subtarget, sorted(SUBTARGETS[target]))]:
+            near = [f"{target}/{known}" for known in nearest(subtarget, sorted(SUBTARGETS[target]))]
+            if near:
                 yield Finding(path, "unknown subtarget", " or ".join(near), profile.target, suggestion(near))
 
 
@@ -359,8 +359,8 @@ def target_of_other_chip(fleet: Fleet, _context: LintContext) -> Iterator[Findin
         for radio in profile.radios:
             expected = chip_target(radio.path)
             if expected is not None and target in TARGETS and target != expected:
-                message = f"{radio.name} is at {radio.path}"
-                yield Finding(("hardware", profile.name, "target"), message, f"{expected}/...", profile.target)
+                path = ("hardware", profile.name, "target")
+                yield Finding(path, f"{radio.name} is at {radio.path}", f"{expected}/...", profile.target)
                 break
 
 
