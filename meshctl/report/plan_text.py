@@ -176,7 +176,9 @@ def _node(group: tuple[NodePlan, ...], *, with_diffs: bool) -> Iterator[Line]:
             yield Line("")
             who = node.node if len(group) == 1 else f"{len(group)} nodes"
             style = "yellow" if node.verdict is Verdict.AWAY else "red"
-            yield Line(f"{who}  {node.verdict.value}: {node.reason}", style)
+            # the error of a failed connection starts with the node
+            reason = node.reason.removeprefix(f"{node.node} ") if len(group) == 1 else node.reason
+            yield Line(f"{who}  {node.verdict.value}: {reason}", style)
             if len(group) > 1:
                 yield Line(f"  {', '.join(member.node for member in group)}")
             if node.hint:
