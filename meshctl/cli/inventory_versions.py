@@ -9,7 +9,7 @@ from meshctl.diagnostics import InvalidInput
 from meshctl.errors import InputError
 from meshctl.inventory.load import load_fleet
 from meshctl.model import Fleet
-from meshctl.nodes.link_snapshots import carried_beacons
+from meshctl.nodes.link_snapshots import carried_beacons, rack_of
 
 
 def versions(fleet: Fleet) -> tuple[tuple[int, int] | None, ...]:
@@ -35,6 +35,15 @@ class BeaconStock:
 
     def count(self) -> int | None:
         """None if the inventory lists none of the robot's. An inventory with errors leaves the last number."""
+        self._read_again()
+        return carried_beacons(self._fleet, self._robot) if self._robot in self._fleet.robots else None
+
+    def names(self) -> frozenset[str]:
+        """Of those on board."""
+        self._read_again()
+        return rack_of(self._fleet, self._robot)
+
+    def _read_again(self) -> None:
         now = versions(self._fleet)
         if now != self._versions:
             try:
@@ -45,4 +54,3 @@ class BeaconStock:
             else:
                 self._fleet = fleet
             self._versions = now
-        return carried_beacons(self._fleet, self._robot) if self._robot in self._fleet.robots else None

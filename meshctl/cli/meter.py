@@ -87,14 +87,15 @@ def meter(
     voice = Voice() if speak else None
     # a path of beacons soon has as many hops
     needed_db = required_snr_db(load, MAX_SHARED_HOPS)
-    poller = _poller_of(fleet_view, robot)
+    stock = BeaconStock(fleet_view.fleet, robot)
+    poller = _poller_of(fleet_view, robot, stock)
     source = _ReadingSource(
         robot,
         poller,
         Meter(needed_db),
         HopMargins(needed_db),
         _Positions(fleet_view, robot, local),
-        BeaconStock(fleet_view.fleet, robot).count if beacons is None else lambda: beacons,
+        stock.count if beacons is None else lambda: beacons,
         spacing,
         fleet_view.opened.access.meter.totals,
         drop,
@@ -116,7 +117,7 @@ def meter(
     raise typer.Exit(ExitCode.INTERRUPTED)
 
 
-def _poller_of(fleet_view: FleetView, robot: str) -> LinkPoller:
+def _poller_of(fleet_view: FleetView, robot: str, stock: BeaconStock) -> LinkPoller:
     """The robot's radios and their base, with the addresses of every node that answers or was seen before."""
     fleet = fleet_view.fleet
     own = own_radios(fleet, robot)
@@ -131,7 +132,7 @@ def _poller_of(fleet_view: FleetView, robot: str) -> LinkPoller:
     if base in own:
         raise InputError(f"{robot} is the base: choose a robot that carries beacons")
     macs = collect(fleet_view, robots=()).macs
-    return LinkPoller(fleet, fleet_view.opened.access, own, macs, base.name, time.time)
+    return LinkPoller(fleet, fleet_view.opened.access, own, macs, base.name, time.time, stock.names)
 
 
 @dataclass(slots=True)

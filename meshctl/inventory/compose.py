@@ -7,7 +7,6 @@ Everything but a syntax error is reported together.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Protocol
@@ -18,14 +17,13 @@ from meshctl.diagnostics import Diagnostic, Position
 from meshctl.inventory import codes
 from meshctl.inventory.source import Source
 from meshctl.inventory.tree import MappingNode, Scalar, SequenceNode, Tree, position
+from meshctl.inventory.yaml_mistakes import syntax_error
 
 # The deepest place of the format, nodes.*.radios.*.mesh, is five levels down.
 MAX_DEPTH = 32
 # 10,000 nodes with 20 values each are 200,000. Bounds memory (about 300 bytes per value) and alias bombs.
 MAX_VALUES = 1_000_000
 
-# The parser stops at the bracket of a name such as b[01-12] in flow style.
-_RANGE_IN_BRACES = re.compile(r"[{,]\s*[\w.-]+\[$")
 # libyaml's, which is several times as fast, where PyYAML was built with it
 LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 # libyaml 0.2.6, in PyYAML from 6.0.4 on, stops at 1,000 levels. It reads ahead, so that can be before the event of the
@@ -60,65 +58,31 @@ class _LibyamlTooDeep(Exception):
 def _composed(source: Source, loader: type[yaml.SafeLoader]) -> _Composer:
     """Raises _LibyamlTooDeep."""
     composer = _Composer(source.file)
+    quote: yaml.ScalarEvent | None = None
     try:
         for event in yaml_events(source.text, loader):
             if not composer.handle(event):
                 break
+            if isinstance(event, yaml.ScalarEvent) and event.style in ("'", '"') and _is_of_several_lines(event):
+                quote = event
     except yaml.MarkedYAMLError as reason:
         if reason.problem == _LIBYAML_TOO_DEEP:
             raise _LibyamlTooDeep from None
-        composer.fail(_syntax_error(source, reason))
+        composer.fail(syntax_error(source, reason, quote))
     except yaml.YAMLError as reason:
         composer.fail(codes.error(codes.YAML_SYNTAX, Position(source.file), f"not valid YAML: {reason}"))
     return composer
+
+
+def _is_of_several_lines(event: yaml.Event) -> bool:
+    start, end = _marks(event)
+    return end.line > start.line
 
 
 def yaml_events(text: str, loader: type[yaml.SafeLoader] = LOADER) -> Iterator[yaml.Event]:
     """Parse with libyaml if there is one. Raises YAMLError."""
     events: Iterator[yaml.Event] = yaml.parse(text, Loader=loader)
     return events
-
-
-def _syntax_error(source: Source, reason: yaml.MarkedYAMLError) -> Diagnostic:
-    mark = reason.problem_mark or reason.context_mark
-    place = Position(source.file)
-    if mark is not None:
-        # libyaml counts one more line if the text does not end in a newline.
-        last = source.text.count("\n")
-        beyond = mark.line > last
-        column = len(source.text) - source.text.rfind("\n") - 1 if beyond else mark.column
-        place = Position(source.file, min(mark.line, last) + 1, column + 1)
-    context = f" {reason.context}" if reason.context else ""
-    return codes.error(
-        codes.YAML_SYNTAX,
-        place,
-        f"not valid YAML{context}: {reason.problem}",
-        hint=_hint(source, place) or _above(reason),
-    )
-
-
-def _above(reason: yaml.MarkedYAMLError) -> str:
-    """A hint for errors that libyaml notices only after the line with the mistake."""
-    late = ("could not find expected ':'", "did not find expected key", "mapping values are not allowed")
-    is_late = (reason.problem or "").startswith(late)
-    return "the mistake may be above: a missing `:`, quote or bracket, or another indentation" if is_late else ""
-
-
-def _hint(source: Source, place: Position) -> str:
-    """A hint for common YAML mistakes."""
-    lines = source.text.splitlines()
-    if not 0 < place.line <= len(lines):
-        return ""
-    before = lines[place.line - 1][: place.column]
-    if "\t" in before:
-        return "indent YAML with spaces, not tabs"
-    if _RANGE_IN_BRACES.search(before):
-        return 'quote a range inside braces: {"b[01-12]": ...}'
-    if before.endswith(":") and before.count(": ") > 0:
-        return "quote a value that contains a colon and a space"
-    if before.endswith(("@", "`", "%")):
-        return f"quote a value that begins with {before[-1]}"
-    return ""
 
 
 class _Mark(Protocol):

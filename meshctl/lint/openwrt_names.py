@@ -23,6 +23,8 @@ TARGETS = _words(
     layerscape loongarch64 malta mediatek microchipsw mpc85xx mvebu mxs nxp octeon octeontx omap oxnas pistachio qoriq
     qualcommax qualcommbe ramips rb532 realtek rockchip sifiveu siflower starfive stm32 sunxi tegra uml x86 zynq"""
 )
+# targets that 21.02 no longer has, and what took their place
+SUCCESSORS: Mapping[str, str] = MappingProxyType({"ar71xx": "ath79", "brcm2708": "bcm27xx", "brcm47xx": "bcm47xx"})
 SUBTARGETS: Mapping[str, frozenset[str]] = MappingProxyType(
     {
         "ath79": _words("generic mikrotik nand tiny"),
@@ -87,6 +89,10 @@ def suggest_packages(name: str) -> tuple[str, ...]:
         return (hyphened,)
     if len(name) < _MIN_LETTERS:
         return ()
+    # a kernel module whose name was cut, such as kmod-batman
+    longer = [known for known in PACKAGES if name.startswith("kmod-") and known.startswith(f"{name}-")]
+    if len(longer) == 1:
+        return tuple(longer)
     return one_edit_apart(name, (known for known in PACKAGES if len(known) >= _MIN_LETTERS))
 
 

@@ -9,14 +9,15 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Container, Iterable, Mapping
+from dataclasses import dataclass, field, replace
 
 from meshctl.device.link_table import LinkTable, read_links
 from meshctl.errors import MeshctlError
 from meshctl.model import Fleet, Node, NodeState
 from meshctl.nodes.connections import ConnectionPool
 from meshctl.placement.margin import (
+    RACK_DBM,
     UNMEASURED_FADE_DB,
     Sample,
     fade_allowance_db,
@@ -26,6 +27,8 @@ from meshctl.placement.margin import (
 from meshctl.placement.meter import LinkSnapshot, PathBeyond, Position, RelayLink
 
 QUERY_S = 3.0
+DROPPED_DB = 15
+"""Between the rack, within a meter, and some meters behind the robot; less than turning the robot changes nothing."""
 MAX_TABLE_AGE_S = 30.0
 """An older table of a relay says nothing: it may have moved or died."""
 MAX_PATH_HOPS = 32
@@ -34,12 +37,44 @@ _KEPT_SAMPLES = 60
 
 @dataclass(frozen=True, slots=True)
 class MeshTables:
-    """The newest table of each node, whose MACs are whose, the radios of the robot, and the base's node."""
+    """The newest table of each node, whose MACs are whose, the radios of the robot, and the base's node. `aboard`: the
+    beacons in the robot's rack that are on, which are no relays."""
 
     tables: Mapping[str, LinkTable]
     names: Mapping[str, str]
     own: tuple[str, ...]
     base: str
+    aboard: frozenset[str] = frozenset()
+
+    def heard_dbm(self) -> dict[str, int]:
+        """The best signal of each node that the robot's radios hear."""
+        names = dict.fromkeys(name for name in self.names.values() if name not in self.own)
+        return {name: found[0] for name in names if (found := _heard(self, name)) is not None}
+
+
+@dataclass(slots=True)
+class Rack:
+    """Which carried beacons are on in the robot's rack: those that it hears strongly from the beginning. Pure.
+
+    One is dropped when it is marked as deployed, or heard more weakly than ever before by `DROPPED_DB`. One that is
+    switched on as it is dropped is heard later, and never counts as aboard.
+    """
+
+    _strongest_dbm: dict[str, int] | None = None
+
+    def aboard(self, heard_dbm: Mapping[str, int], carried: Container[str]) -> frozenset[str]:
+        """The beacons aboard, of those that the inventory has as `carried`, at what the robot hears now."""
+        if self._strongest_dbm is None:
+            if not heard_dbm:
+                return frozenset()
+            self._strongest_dbm = {name: dbm for name, dbm in heard_dbm.items() if dbm >= RACK_DBM}
+        for name, strongest_dbm in tuple(self._strongest_dbm.items()):
+            now_dbm = heard_dbm.get(name, strongest_dbm)
+            if name not in carried or now_dbm < strongest_dbm - DROPPED_DB:
+                del self._strongest_dbm[name]
+            else:
+                self._strongest_dbm[name] = max(now_dbm, strongest_dbm)
+        return frozenset(self._strongest_dbm)
 
 
 @dataclass(slots=True)
@@ -91,7 +126,7 @@ def assemble(
     heard = {
         name: found
         for name in dict.fromkeys(mesh.names.values())
-        if name not in mesh.own and (found := _heard(mesh, name)) is not None
+        if name not in mesh.own and name not in mesh.aboard and (found := _heard(mesh, name)) is not None
     }
     for name, (dbm, noise_dbm) in heard.items():
         back = max((reading for own in mesh.own if (reading := signal_of(mesh, name, own))), default=(None, None))
@@ -103,6 +138,8 @@ def assemble(
         table = mesh.tables.get(own)
         if table is not None and table.next_hop:
             next_hop = mesh.names.get(table.next_hop, "")
+            # the hop that matters is the one from the robot to what stays behind
+            next_hop = "" if next_hop in mesh.aboard else next_hop
     return LinkSnapshot(
         now_s,
         tuple(links) if fresh else (),
@@ -125,7 +162,7 @@ def _heard(mesh: MeshTables, name: str) -> tuple[int, int | None] | None:
 
 def path_beyond(mesh: MeshTables, margins: HopMargins, relay: str) -> PathBeyond | None:
     """The way from a relay to the base by the nodes' own next hops; None if it has none, or if it leads through the
-    robot itself. For a relay that has not been queried yet, one hop at least."""
+    robot itself or its rack. For a relay that has not been queried yet, one hop at least."""
     found: list[tuple[float, float]] = []
     node, hops = relay, 0
 
@@ -139,7 +176,7 @@ def path_beyond(mesh: MeshTables, margins: HopMargins, relay: str) -> PathBeyond
             hops += 1
             return path()
         after = mesh.names.get(table.next_hop, "")
-        if not after or after in mesh.own or hops >= MAX_PATH_HOPS:
+        if not after or after in mesh.own or after in mesh.aboard or hops >= MAX_PATH_HOPS:
             return None
         hop = margins.of(mesh, node, after)
         if hop is not None:
@@ -158,6 +195,8 @@ class LinkPoller:
     macs: Mapping[str, str]
     base: str
     clock: Callable[[], float]
+    carried: Callable[[], Container[str]] = frozenset
+    _rack: Rack = field(default_factory=Rack)
     _tables: dict[str, LinkTable] = field(default_factory=dict)
     _busy: set[str] = field(default_factory=set)
     _problems: dict[str, str] = field(default_factory=dict)
@@ -183,7 +222,8 @@ class LinkPoller:
         now_s = self.clock()
         with self._lock:
             recent = {name: table for name, table in self._tables.items() if now_s - table.taken_s <= MAX_TABLE_AGE_S}
-        return MeshTables(recent, self.macs, tuple(node.name for node in self.own), self.base)
+        mesh = MeshTables(recent, self.macs, tuple(node.name for node in self.own), self.base)
+        return replace(mesh, aboard=self._rack.aboard(mesh.heard_dbm(), self.carried()))
 
     def own_taken_s(self) -> float:
         """When the robot's newest table was taken; 0 before the first."""
@@ -199,14 +239,7 @@ class LinkPoller:
     def _relays(self) -> list[str]:
         """The nodes that the robot hears, and those on their paths, strongest and nearest first."""
         mesh = self.mesh()
-        heard = sorted(
-            (
-                (found[0], name)
-                for name in dict.fromkeys(mesh.names.values())
-                if name not in mesh.own and (found := _heard(mesh, name))
-            ),
-            reverse=True,
-        )
+        heard = sorted(((dbm, name) for name, dbm in mesh.heard_dbm().items() if name not in mesh.aboard), reverse=True)
         wanted = [name for _, name in heard[:4]]
         for name in tuple(wanted):
             node = name
@@ -240,6 +273,13 @@ def carried_beacons(fleet: Fleet, robot: str) -> int | None:
     """How many beacons the robot still carries according to the inventory; None if it carries none there at all."""
     carried = [fleet.nodes[name] for name in fleet.robots[robot].carries if name in fleet.nodes]
     return sum(node.state is NodeState.CARRIED for node in carried) if carried else None
+
+
+def rack_of(fleet: Fleet, robot: str) -> frozenset[str]:
+    """What the robot, or the robot of this node, carries according to the inventory."""
+    name = robot if robot in fleet.robots else fleet.nodes[robot].robot if robot in fleet.nodes else ""
+    carries = fleet.robots[name].carries if name in fleet.robots else ()
+    return frozenset(name for name in carries if name in fleet.nodes and fleet.nodes[name].state is NodeState.CARRIED)
 
 
 def own_radios(fleet: Fleet, robot: str) -> tuple[Node, ...]:

@@ -12,6 +12,9 @@ import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
+# Free space attenuates 2.4 GHz by 40 dB and 5.8 GHz by 48 dB per meter (FSPL); with 20 dBm and no antenna gain a radio
+# within a meter is stronger than this even through a chassis of 30 dB.
+RACK_DBM = -60
 UNMEASURED_FADE_DB = 10.0
 FADE_WINDOW_S = 10.0
 FADE_DEVIATIONS = 1.65

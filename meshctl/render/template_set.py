@@ -22,9 +22,11 @@ from jinja2 import (
     TemplateSyntaxError,
 )
 from jinja2.sandbox import ImmutableSandboxedEnvironment
+from jinja2.utils import missing
 
 from meshctl.diagnostics import Diagnostic, InvalidInput, Position, Severity
 from meshctl.file_access import Boundary, located
+from meshctl.inventory.suggest import did_you_mean
 from meshctl.model import Backend, MeshMode, OperatorParts, Release
 from meshctl.render.quoting import quoted, require_quoted, revealed
 from meshctl.render.template_files import (
@@ -107,10 +109,23 @@ class _BoundedLoader(FileSystemLoader):
         return super().get_source(environment, template)
 
 
+class _Missing(StrictUndefined):
+    """Names what the value has instead, since templates are written without the code at hand."""
+
+    @property
+    def _undefined_message(self) -> str:
+        name, value = self._undefined_name, self._undefined_obj
+        if self._undefined_hint or value is missing or isinstance(value, Mapping):
+            return super()._undefined_message
+        known = [known for known in dir(value) if not known.startswith("_")]
+        instead = did_you_mean(str(name), known) or f"it has {', '.join(known)}"
+        return f"{type(value).__name__} has no {name!r}; {instead}"
+
+
 def _environment(kind: type[Environment], loader: BaseLoader, *, is_uci: bool = False) -> Environment:
     environment = kind(
         loader=loader,
-        undefined=StrictUndefined,
+        undefined=_Missing,
         autoescape=False,
         trim_blocks=True,
         lstrip_blocks=True,

@@ -1,7 +1,7 @@
 """Find beacons that have been dropped although the inventory has them as carried, from one snapshot. Pure.
 
-A beacon in a robot's rack is off, or within a meter of the robot's own radios. One that answers has been dropped if
-others reach the base through it, or if its robot's radios hear it weakly or not at all while another node hears it.
+A beacon in a robot's rack is off, or within a meter of the robot's own radios. One that answers has been dropped if its
+robot's radios hear it weakly or not at all while another node hears it, or reaches the base through it.
 """
 
 from __future__ import annotations
@@ -9,12 +9,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from meshctl.model import Fleet, NodeState, Role
+from meshctl.placement.margin import RACK_DBM
 from meshctl.status.node_alarms import join_limited
 from meshctl.status.values import NodeStatus
-
-# Free space attenuates 2.4 GHz by 40 dB and 5.8 GHz by 48 dB per meter (FSPL); with 20 dBm and no antenna gain a radio
-# within a meter is stronger than this even through a chassis of 30 dB.
-RACK_DBM = -60
 
 
 def dropped_beacons(fleet: Fleet, nodes: Iterable[NodeStatus]) -> dict[str, str]:
@@ -31,18 +28,19 @@ def dropped_beacons(fleet: Fleet, nodes: Iterable[NodeStatus]) -> dict[str, str]
 
 
 def _reason(beacon: NodeStatus, radios: Iterable[NodeStatus]) -> str:
-    if beacon.relays:
-        return f"relays to the base for {join_limited(beacon.relays)}"
     answering = [radio for radio in radios if radio.health.answers]
     own = {radio.name for radio in answering}
+    heard = [neighbor for neighbor in beacon.neighbors if neighbor.name in own]
+    signals = [neighbor.signal_dbm for neighbor in heard if neighbor.signal_dbm is not None]
+    # the mesh relays through a rack as through any other place
+    if beacon.relays and max(signals, default=RACK_DBM - 1) < RACK_DBM:
+        return f"relays to the base for {join_limited(beacon.relays)}"
     if not answering or not beacon.neighbors:
         # a robot that does not answer says nothing about where its beacons are
         return ""
-    heard = [neighbor for neighbor in beacon.neighbors if neighbor.name in own]
     if not heard:
         names = join_limited(tuple(neighbor.name for neighbor in beacon.neighbors))
         return f"hears {names}, not its robot's {_names(own)}"
-    signals = [neighbor.signal_dbm for neighbor in heard if neighbor.signal_dbm is not None]
     if signals and max(signals) < RACK_DBM:
         return f"hears its robot's {_names(own)} with {max(signals)} dBm only"
     return ""

@@ -300,8 +300,9 @@ def public_key_to_log_in(fleet: Fleet, context: LintContext) -> Iterator[Finding
 @fleet_rule(
     "MC434",
     Severity.ERROR,
-    "An SSH host contains the user or the port",
-    why="`ssh.host` is a name or an address alone: with a user or a port in it, no login reaches the device.",
+    "An SSH host contains the user or the port, or a user the host",
+    why="""`ssh.host` is a name or an address alone, and `ssh.user` a user's name: with both in one of them, no login
+    reaches the device.""",
     fix="Write them under their own keys: `ssh: {host: gw.example, port: 2222, user: mesh}`.",
     failing="robots: {husky1: {computer: {ssh: {host: 'robot@10.42.0.110:2222'}}}}",
     passing="robots: {husky1: {computer: {ssh: {host: 10.42.0.110, port: 2222}}}}",
@@ -315,6 +316,9 @@ def host_with_user_or_port(fleet: Fleet, _context: LintContext) -> Iterator[Find
             parts = {"host": bracketed or host, "port": port or other_port, "user": user}
             expected = ", ".join(f"{key}: {value}" for key, value in parts.items() if value)
             yield Finding((*place, "host"), "not a host name or address alone", expected, ssh.host)
+        user, at, host = ssh.user.rpartition("@")
+        if at:
+            yield Finding((*place, "user"), "not a user's name alone", f"user: {user}, host: {host}", ssh.user)
 
 
 def _is_public_key(text: str) -> bool:

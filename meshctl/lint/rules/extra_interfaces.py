@@ -25,7 +25,25 @@ _NEEDED = {
     "mesh": ("device", "mesh_id"),
     "": ("device", "mode", "ssid"),
 }
-_EXAMPLES = {"device": "radio1", "mode": "ap", "ssid": "my-guests", "mesh_id": "my-mesh", "network": "lan"}
+# of other packages, whatever the mode (fw3, fw4, netifd and dnsmasq's init script skip the section)
+_NEEDED_ELSEWHERE = {
+    ("firewall", "forwarding"): ("src", "dest"),
+    ("firewall", "zone"): ("name",),
+    ("network", "route"): ("interface",),
+    ("network", "route6"): ("interface",),
+    ("dhcp", "dhcp"): ("interface",),
+}
+_EXAMPLES = {
+    "device": "radio1",
+    "mode": "ap",
+    "ssid": "my-guests",
+    "mesh_id": "my-mesh",
+    "network": "lan",
+    "src": "management",
+    "dest": "wan",
+    "name": "wan",
+    "interface": "lan",
+}
 _GUEST = """
     nodes: {b01: {extra_uci: {wireless.guest: wifi-iface, wireless.guest.device: radio0, wireless.guest.mode: ap,
       wireless.guest.ssid: guests, wireless.guest.encryption: owe, wireless.guest.network: visitors, MORE
@@ -39,29 +57,35 @@ _CAMERA = """
 @fleet_rule(
     "MC921",
     Severity.ERROR,
-    "A wireless interface of extra_uci is incomplete",
-    why="""Without `device` no radio brings it up, without `mode` OpenWrt does not, hostapd refuses an access point
-    without a name, and what connects to one without `network` gets no address. A change that adds it is
-    rolled back, or it is there and leads nowhere.""",
+    "A section of extra_uci is incomplete",
+    why="""A wireless interface without `device` is brought up by no radio, without `mode` not by OpenWrt; hostapd
+    refuses an access point without a name, and what connects to one without `network` gets no address. The firewall
+    ignores a forwarding without both of its zones and a zone without a name, dnsmasq a range and netifd a route without
+    an interface. A change that adds such a section is rolled back, or it is there and does nothing.""",
     fix="Add the option that the finding names.",
     failing=_GUEST.replace("wireless.guest.ssid: guests,", "").replace("MORE", ""),
     passing=_GUEST.replace("MORE", ""),
 )
-def wireless_incomplete(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
+def section_incomplete(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     for node, packages in with_extra(fleet, context):
-        for name, interface in created_sections(node, packages, "wireless"):
-            if interface.type != "wifi-iface" or is_on(interface, "disabled"):
-                continue
-            mode = interface.get("mode")
-            needed = _NEEDED.get(mode, ())
-            # a bridge may name the interface instead
-            if needed and not interface.get("ifname"):
-                needed = (*needed, "network")
-            missing = [option for option in needed if not interface.get(option)]
-            if missing:
-                expected = " and ".join(f"wireless.{name}.{option}: {_EXAMPLES[option]}" for option in missing)
-                path = ("nodes", node.name, "extra_uci", f"wireless.{name}")
-                yield Finding(path, f"no {' and no '.join(missing)}", expected, "none")
+        for package in ("wireless", "network", "firewall", "dhcp"):
+            for name, section in created_sections(node, packages, package):
+                missing = [option for option in _needed(package, section) if not section.get(option)]
+                if missing:
+                    expected = " and ".join(f"{package}.{name}.{option}: {_EXAMPLES[option]}" for option in missing)
+                    path = ("nodes", node.name, "extra_uci", f"{package}.{name}")
+                    yield Finding(path, f"no {' and no '.join(missing)}", expected, "none")
+
+
+def _needed(package: str, section: Section) -> tuple[str, ...]:
+    """The options without which the section does nothing."""
+    if (package, section.type) != ("wireless", "wifi-iface"):
+        return _NEEDED_ELSEWHERE.get((package, section.type), ())
+    needed = _NEEDED.get(section.get("mode"), ())
+    if is_on(section, "disabled"):
+        return ()
+    # a bridge may name the interface instead
+    return needed if not needed or section.get("ifname") else (*needed, "network")
 
 
 @fleet_rule(

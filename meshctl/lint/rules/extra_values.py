@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator
-from ipaddress import IPv4Network, ip_interface
+from ipaddress import IPv4Network, IPv6Network, ip_interface
 
 from meshctl.diagnostics import Severity
 from meshctl.inventory.suggest import did_you_mean, suggestion
@@ -18,6 +18,7 @@ from meshctl.model import Fleet
 _Check = Callable[[str], tuple[str, str] | None]
 
 _MAX_SSID_BYTES = 32
+_UNIQUE_LOCAL = IPv6Network("fc00::/7")
 # OpenWrt's wifi scripts look for these in the value
 _METHODS = ("psk", "sae", "owe", "wpa", "wep", "8021x")
 
@@ -81,6 +82,14 @@ def _addresses(value: str) -> tuple[str, str] | None:
     return None
 
 
+def _ula_prefix(value: str) -> tuple[str, str] | None:
+    try:
+        is_valid = value == "auto" or IPv6Network(value).subnet_of(_UNIQUE_LOCAL)
+    except ValueError:
+        is_valid = False
+    return None if is_valid else ("auto, or a prefix in fc00::/7 such as fd42:80::/48", "")
+
+
 def _netmask(value: str) -> tuple[str, str] | None:
     try:
         IPv4Network(f"0.0.0.0/{value}")
@@ -129,13 +138,14 @@ _CHECKS: dict[tuple[str, str, str], _Check] = {
     ("network", "interface", "ip6addr"): _addresses,
     ("network", "interface", "netmask"): _netmask,
     ("network", "interface", "gw_mode"): _one_of("off", "client", "server"),
+    ("network", "globals", "ula_prefix"): _ula_prefix,
     **{("firewall", kind, chain): _POLICY for kind in ("defaults", "zone") for chain in ("input", "output", "forward")},
     ("firewall", "rule", "target"): _not_misspelled("ACCEPT", "REJECT", "DROP", "MARK", "NOTRACK"),
     ("firewall", "redirect", "target"): _not_misspelled("DNAT", "SNAT"),
 }
 _TYPES = {
     "wireless": _not_misspelled("wifi-iface", "wifi-device"),
-    "network": _not_misspelled("interface", "device", "route", "route6", "rule", "rule6"),
+    "network": _not_misspelled("interface", "device", "globals", "route", "route6", "rule", "rule6", "switch_vlan"),
     "firewall": _not_misspelled("zone", "forwarding", "rule", "redirect", "include", "ipset"),
     "dhcp": _not_misspelled("dhcp", "dnsmasq", "host", "odhcpd"),
 }

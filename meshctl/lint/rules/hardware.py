@@ -10,7 +10,7 @@ from meshctl import firmware
 from meshctl.diagnostics import Severity
 from meshctl.inventory.suggest import nearest, suggestion
 from meshctl.lint.context import LintContext
-from meshctl.lint.openwrt_names import SUBTARGETS, TARGETS, chip_target, suggest_packages
+from meshctl.lint.openwrt_names import SUBTARGETS, SUCCESSORS, TARGETS, chip_target, suggest_packages
 from meshctl.lint.rule import Example, Finding, fleet_rule
 from meshctl.lint.rules.encryption import packages_path
 from meshctl.lint.rules.firmware import ROCKET_IMAGE
@@ -316,23 +316,23 @@ def package_misspelt(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     "MC833",
     Severity.WARNING,
     "The OpenWrt target is unknown",
-    why="""The ImageBuilder is selected by target, and the image metadata contains it: a misspelled target matches
-    neither.""",
+    why="""The ImageBuilder is selected by target, and the image metadata contains it: a misspelled target, or one that
+    the release no longer has, matches neither.""",
     fix="Read the target from the device: release.target of `ubus call system board`.",
     failing="hardware: {rocket: {target: ath97/generic}}",
     passing="hardware: {rocket: {target: ath79/generic}}",
 )
 def target_unknown(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for profile in fleet.hardware.values():
-        target, slash, subtarget = profile.target.partition("/")
+        target, _, subtarget = profile.target.partition("/")
         path = ("hardware", profile.name, "target")
-        if not slash:
-            continue
-        # releases add targets: report only names similar to a known one
-        if target not in TARGETS:
-            _, hint = suggest(TARGETS, target)
-            if hint:
+        # releases add targets: report only names similar to a known one (and MC826 a target without a subtarget)
+        if target not in TARGETS and subtarget:
+            if hint := suggest(TARGETS, target)[1]:
                 yield Finding(path, "unknown target", "a target of OpenWrt", profile.target, hint)
+        elif target in SUCCESSORS and profile.release >= Release.V21_02:
+            expected = f"{SUCCESSORS[target]}/{subtarget}"
+            yield Finding(path, f"OpenWrt {profile.release} has no {target}", expected, profile.target)
         elif target in SUBTARGETS and subtarget not in SUBTARGETS[target]:
             near = [f"{target}/{known}" for known in nearest(subtarget, sorted(SUBTARGETS[target]))]
             if near:
@@ -359,8 +359,8 @@ def target_of_other_chip(fleet: Fleet, _context: LintContext) -> Iterator[Findin
         for radio in profile.radios:
             expected = chip_target(radio.path)
             if expected is not None and target in TARGETS and target != expected:
-                message = f"{radio.name} is at {radio.path}"
-                yield Finding(("hardware", profile.name, "target"), message, f"{expected}/...", profile.target)
+                path = ("hardware", profile.name, "target")
+                yield Finding(path, f"{radio.name} is at {radio.path}", f"{expected}/...", profile.target)
                 break
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterable, Iterator
 
@@ -264,7 +265,7 @@ def host_key_not_pinned(fleet: Fleet, context: LintContext) -> Iterator[Finding]
     strangers = [node.name for node in _deployed(fleet) if not node.host_keys and node.name not in pinned]
     if strangers and _HASHED not in pinned:
         found = f"none for {join_limited(strangers)}"
-        expected = f"`host_keys`, or lines in {fleet.operators.known_hosts}"
+        expected = f"`host_keys`, or lines in {os.path.normpath(fleet.operators.known_hosts)}"
         yield Finding(("nodes", strangers[0]), "host keys cannot be verified", expected, found)
 
 

@@ -252,7 +252,8 @@ def beamwidth_contradicts(fleet: Fleet, _context: LintContext) -> Iterator[Findi
     for profile in fleet.hardware.values():
         for radio in profile.radios:
             if (radio.antenna is AntennaKind.OMNI) != (radio.beamwidth_deg == 360):
-                path = ("hardware", profile.name, "radios", radio.name, "beamwidth_deg")
+                place = ("hardware", profile.name, "radios", radio.name)
+                path = first_written(fleet, (*place, "beamwidth_deg"), (*place, "antenna"))
                 expected = "360" if radio.antenna is AntennaKind.OMNI else "less than 360"
                 yield Finding(path, f"antenna is {radio.antenna.value}", expected, str(radio.beamwidth_deg))
 

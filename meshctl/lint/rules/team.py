@@ -270,20 +270,26 @@ def robot_without_radio(fleet: Fleet, _context: LintContext) -> Iterator[Finding
 @fleet_rule(
     "MC610",
     Severity.WARNING,
-    "A robot radio belongs to no robot",
+    "A node's role and its robot do not match",
     why="""A node with `role: robot` moves together with everything behind it. Without its robot, lint cannot detect
-    loops, and plans cannot determine what a change disconnects.""",
-    fix="List it under the robot's `nodes`, or change its role.",
+    loops, and plans cannot determine what a change disconnects. A radio that a robot has under `nodes`, but with the
+    role of a beacon (the default), is counted and marked as one.""",
+    fix="List a robot's radio under its `nodes`, with `role: robot`; list beacons under `carries`.",
     failing="nodes: {stray: {role: robot, address: 10.42.0.77}}",
     passing="""
     nodes: {stray: {role: robot, address: 10.42.0.77}}
     robots: {husky1: {nodes: [husky1-front, stray]}}
     """,
 )
-def robot_radio_without_robot(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+def role_without_robot(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    mounted_on = {name: robot.name for robot in fleet.robots.values() for name in robot.nodes}
     for node in fleet.managed():
         if node.role is Role.ROBOT and not node.robot and fleet.robots:
             yield Finding(("nodes", node.name), "belongs to no robot", "a robot that lists it", "none")
+        elif node.role is Role.BEACON and node.name in mounted_on:
+            path = first_written(fleet, ("nodes", node.name, "role"), ("nodes", node.name))
+            message = f"{mounted_on[node.name]} lists it as its radio"
+            yield Finding(path, message, "role: robot, or base for the base station", node.role.value)
 
 
 @fleet_rule(

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from meshctl.diagnostics import Severity
 from meshctl.inventory.suggest import nearest, suggestion
 from meshctl.lint.context import LintContext
+from meshctl.lint.openwrt_names import one_edit_apart
 from meshctl.lint.ros_types import MESSAGES
 from meshctl.lint.rule import Finding, fleet_rule
 from meshctl.model import Fleet, Outbox, Topic, TopicClass
@@ -260,9 +261,9 @@ def _always_sent(fleet: Fleet, topic: Topic) -> str:
 @fleet_rule(
     "MC726",
     Severity.WARNING,
-    "A topic's type does not exist in its ROS package",
-    why="""The packages that come with ROS have a fixed set of messages. The bridge finds none of this name, so
-    nothing is passed on the topic.""",
+    "A topic's type does not exist in ROS",
+    why="""The packages that come with ROS have a fixed set of messages, and no package has almost the name of one of
+    them. The bridge finds no message of this name, so nothing is passed on the topic.""",
     fix="Write the message's name as `rosmsg show` or `ros2 interface show` know it.",
     failing="topics: {commands: {type: std_msgs/Boolean}}",
     passing="topics: {commands: {type: my_msgs/Boolean}}",
@@ -276,3 +277,7 @@ def type_unknown(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
             near = [topic.type_name.removesuffix(name) + known_name for known_name in nearest(name, sorted(known))]
             expected, hint = " or ".join(near) or f"a message of {package}", suggestion(near)
             yield Finding(_path(topic, "type"), f"{package} has no such message", expected, topic.type_name, hint)
+        elif rest and not known and (packages := one_edit_apart(package, MESSAGES)):
+            near = [f"{other}/{rest}" for other in packages]
+            message = f"{package} is no package of ROS"
+            yield Finding(_path(topic, "type"), message, " or ".join(near), topic.type_name, suggestion(near))

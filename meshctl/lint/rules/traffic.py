@@ -278,6 +278,9 @@ def metrics_port_shared(fleet: Fleet, _context: LintContext) -> Iterator[Finding
             yield Finding(("udp_mesh", "metrics_port"), message, "another port", str(port))
 
 
+_USUAL_OFFLINE_S = 10
+
+
 @fleet_rule(
     "MC739",
     Severity.ERROR,
@@ -291,7 +294,9 @@ def metrics_port_shared(fleet: Fleet, _context: LintContext) -> Iterator[Finding
 def offline_too_soon(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     settings = fleet.udp_mesh
     if settings.offline_after_s < 3 * settings.heartbeat_s:
-        path = first_written(fleet, ("udp_mesh", "offline_after_s"), ("udp_mesh", "heartbeat_s"))
+        paths = (("udp_mesh", "offline_after_s"), ("udp_mesh", "heartbeat_s"))
+        # the one that is farther from what is usual, so that milliseconds are found where they are written
+        path = first_written(fleet, *(reversed(paths) if settings.heartbeat_s > _USUAL_OFFLINE_S else paths))
         expected = f"at least {3 * settings.heartbeat_s:g} s (3 heartbeats)"
         yield Finding(path, "offline after fewer than 3 heartbeats", expected, f"{settings.offline_after_s:g} s")
 

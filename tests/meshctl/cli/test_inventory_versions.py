@@ -21,6 +21,7 @@ def test_the_stock_follows_what_deployed_marks(tmp_path: Path) -> None:
     set_state(editor, "rover1-b03", NodeState.DEPLOYED)
     save(editor.changes())
     assert stock.count() == 5
+    assert stock.names() == {"rover1-b01", "rover1-b02", "rover1-b04", "rover1-b05", "rover1-b06"}
     file = inventory / "fleet.yaml"
     text = file.read_text(encoding="utf-8")
     file.write_text(text + "nodes: [half an edit", encoding="utf-8")
@@ -36,3 +37,5 @@ def test_a_robot_without_beacons_has_no_stock(tmp_path: Path) -> None:
     assert BeaconStock(fleet, "base-station").count() is None
     # a node that moves with a robot
     assert BeaconStock(fleet, "rover1-radio").count() is None
+    assert len(BeaconStock(fleet, "rover1-radio").names()) == 6
+    assert BeaconStock(fleet, "base-station").names() == frozenset()

@@ -34,7 +34,7 @@ _WHOLE_FILES = {
     "python tag": ("fleet: !!python/object/apply:os.system [id]\n", "INV005", 1, 8),
     "binary tag": ("fleet: !!binary aGk=\n", "INV005", 1, 8),
     "tab": ("system:\n\tlog_port: 1\n", "INV004", 2, 1),
-    "unclosed bracket": ("include: [a\n", "INV004", 2, 1),
+    "unclosed bracket": ("include: [a\n", "INV004", 1, 10),
     "control character": ("fleet: a\x07b\n", "INV003", 1, 9),
     "deep nesting": ("[" * 100_000, "INV008", 1, 33),
     "deep blocks": ("".join(" " * depth + "a:\n" for depth in range(100)), "INV008", 33, 33),
@@ -386,7 +386,7 @@ def test_a_pipe_in_the_inventory_s_directory_is_not_waited_for(tmp_path: Path) -
     assert problem.message == "cannot be read: not a regular file (a pipe, socket or device)"
 
 
-@pytest.mark.parametrize("text", ["operators\n  ssh_keys: []\n", "nodes:\n  a: {}\n b: {}\n"])
+@pytest.mark.parametrize("text", ["a:\n    text words\n  b: 1\n", "a: >-\n    some text\n  b: 1\n"])
 def test_a_syntax_error_that_is_noticed_late_points_above(text: str, tmp_path: Path) -> None:
     assert errors_of(tmp_path, text)[0].hint.startswith("the mistake may be above")
 

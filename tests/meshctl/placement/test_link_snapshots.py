@@ -12,7 +12,7 @@ import pytest
 from meshctl.device.framing import quoted
 from meshctl.device.link_table import LinkTable, links_script, parse_links
 from meshctl.device.parse.sections import split_sections
-from meshctl.nodes.link_snapshots import HopMargins, MeshTables, assemble, path_beyond
+from meshctl.nodes.link_snapshots import HopMargins, MeshTables, Rack, assemble, path_beyond
 from meshctl.placement.meter import PathBeyond, RelayLink
 from meshctl.robots.local_daemon import DaemonError, LocalDaemon
 
@@ -99,6 +99,34 @@ def test_a_relay_that_was_not_asked_yet_counts_as_one_hop() -> None:
     seen = mesh(spot1=table(0.0, "b01", b01=-70))
     assert path_beyond(seen, HopMargins(7.0), "b01") == PathBeyond(1)
     assert path_beyond(seen, HopMargins(7.0), "base") == PathBeyond(0)
+
+
+def test_what_is_in_the_rack_is_no_relay() -> None:
+    """b01 is on in spot1's rack, and spot1's traffic goes through it to the base."""
+    seen = mesh(
+        spot1=table(10.0, "b01", b01=-30, b02=-80, base=-88),
+        b01=table(9.0, "base", spot1=-30, base=-87),
+        b02=table(9.0, "b01", spot1=-81, b01=-80),
+    )
+    snapshot = assemble(replace(seen, aboard=frozenset({"b01"})), HopMargins(7.0), 10.0, fresh=True)
+    assert {link.relay for link in snapshot.links} == {"base", "b02"}
+    # b02 reaches the base through the rack alone
+    assert set(snapshot.paths) == {"base"}
+    assert snapshot.next_hop == ""
+
+
+def test_a_beacon_leaves_the_rack_when_it_is_marked_or_heard_weakly() -> None:
+    rack = Rack()
+    assert rack.aboard({}, {"b01", "b02", "b03"}) == frozenset()
+    assert rack.aboard({"b01": -30, "b02": -35, "b03": -75, "base": -40}, {"b01", "b02", "b03"}) == {"b01", "b02"}
+    # fading, and one snapshot without it
+    assert rack.aboard({"b01": -44, "b02": -31}, {"b01", "b02", "b03"}) == {"b01", "b02"}
+    assert rack.aboard({"b02": -45}, {"b01", "b02", "b03"}) == {"b01", "b02"}
+    # dropped: b01 is behind the robot, b02 is marked beside it
+    assert rack.aboard({"b01": -46, "b02": -45}, {"b01", "b02", "b03"}) == {"b02"}
+    assert rack.aboard({"b01": -30, "b02": -45}, {"b01", "b03"}) == frozenset()
+    # one that is switched on as it is dropped is a relay at once
+    assert rack.aboard({"b01": -30, "b02": -45, "b03": -30}, {"b01", "b03"}) == frozenset()
 
 
 def test_next_hops_in_a_circle_are_no_path() -> None:

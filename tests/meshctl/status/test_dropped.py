@@ -33,6 +33,38 @@ def test_a_beacon_that_relays_has_been_dropped(fleet: Fleet) -> None:
     assert judged(fleet, relays=("b01",)) == {"b02": "relays to the base for b01"}
 
 
+@pytest.mark.parametrize("signal", [-60, -35])
+def test_a_relay_that_its_robot_hears_strongly_is_on_in_the_rack(signal: int, fleet: Fleet) -> None:
+    assert judged(fleet, relays=("b01",), neighbors=heard(b01=-70, rover=signal)) == {}
+
+
+@pytest.mark.parametrize("neighbors", [heard(rover=-61), heard(rover=None), heard(b01=-70)])
+def test_a_relay_that_its_robot_does_not_hear_strongly_has_been_dropped(
+    neighbors: tuple[Neighbor, ...], fleet: Fleet
+) -> None:
+    assert judged(fleet, relays=("b01",), neighbors=neighbors) == {"b02": "relays to the base for b01"}
+
+
+def test_status_does_not_note_a_relay_of_its_own_robot_alone(fleet: Fleet) -> None:
+    """Side by side, a robot's best path often leads through its own rack."""
+    through = {
+        "base": seen("base", {"b02": 250}),
+        "b02": seen("b02", {"base": 250, "rover": 250}),
+        "rover": seen("rover", {"b02": 250}),
+    }
+    (stray,) = (node.relays for node in status_of(fleet, through).nodes if node.name == "b02")
+    assert stray == ("rover",)
+    rover = replace(fleet.robots["rover"], carries=("b02",))
+    team = replace(fleet, robots=MappingProxyType({**fleet.robots, "rover": rover}))
+    (aboard,) = (node.relays for node in status_of(team, through).nodes if node.name == "b02")
+    assert aboard == ()
+    assert "dropped" not in alarms(status_of(team, through), "b02")
+    deployed = replace(fleet.nodes["b02"], state=NodeState.DEPLOYED)
+    after = replace(team, nodes=MappingProxyType({**team.nodes, "b02": deployed}))
+    (relays,) = (node.relays for node in status_of(after, through).nodes if node.name == "b02")
+    assert relays == ("rover",)
+
+
 def test_a_beacon_that_its_robot_does_not_hear_has_been_dropped(fleet: Fleet) -> None:
     assert judged(fleet, neighbors=heard(b01=-55)) == {"b02": "hears b01, not its robot's rover"}
     assert judged(fleet, neighbors=heard(b01=-55, rover=-71)) == {"b02": "hears its robot's rover with -71 dBm only"}
