@@ -103,6 +103,8 @@ def reconnect(
 def reach_behind(run_context: RunContext, node: str, now: Observation, names: Iterable[str]) -> frozenset[str]:
     """Have a node that has rebooted repair its links to these neighbors, which drop its frames: those behind it are
     reached by no other. Returns the nodes that may be reachable now."""
+    if run_context.interrupt.stopping:
+        return frozenset()
     observed = FleetObservation({node: now}, dict.fromkeys(names, ""), {})
     owners = run_context.current_mac_owners()
     interrupt, observer = run_context.interrupt, run_context.observer

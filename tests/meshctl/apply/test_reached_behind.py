@@ -72,3 +72,12 @@ def test_it_sends_nothing_to_a_node_that_it_does_not_hear() -> None:
     flush.ended(after_the_boot(inactive_ms=reconnect.HEARD_MS), went_back=True, rebooted=True)
     assert chain.sent == []
     assert chain.flushes.retry_unanswered(chain.work) == {"b02": ("b03",)}
+
+
+def test_an_operator_who_leaves_does_not_wait_for_it() -> None:
+    chain = Chain()
+    flush = chain.flushes.listener(chain.job, NO_RADIOS)
+    flush.started()
+    chain.work.interrupt.request()
+    flush.ended(after_the_boot(inactive_ms=100), went_back=True, rebooted=True)
+    assert chain.sent == []
