@@ -77,18 +77,16 @@ class ChangeInProgress:
     # since the change was last observed as applied: the refused login, and why the node was unreachable
     login_refused: str = ""
     connect_error: str = ""
-    # from now on the change is only ever aborted
-    is_abandoned: bool = False
-    # how long its `extra` script may take before the confirm window starts
-    extra_s: float = 0.0
+    is_abandoned: bool = False  # from now on the change is only ever aborted
+    # a confirmation was sent, and the node has not answered: it may have kept the change
+    is_confirm_unanswered: bool = False
+    extra_s: float = 0.0  # how long its `extra` script may take before the confirm window starts
     armed_in_s: float = 0.0  # how long its node took to arm it: a start takes about as long
     # uploads again what that script reads from the node's memory, which a reboot has emptied
     upload_again: Callable[[SshConnection], object] | None = None
     radios: Radios = NO_RADIOS
-    # when it was started, by the monotonic clock
-    started_s: float | None = None
-    # the one of `candidates` where the node answered
-    found_at: Endpoint | None = None
+    started_s: float | None = None  # by the monotonic clock
+    found_at: Endpoint | None = None  # the one of `candidates` where the node answered
     # whether its services have reloaded: only a connection opened after that proves the node reachable
     is_reloaded: bool = False
     listener: ChangeListener = field(init=False, repr=False)
@@ -381,11 +379,13 @@ def confirm(change: ChangeInProgress, proof: SshConnection | None = None) -> boo
 
 
 def _confirm_over(change: ChangeInProgress, connection: SshConnection) -> bool:
-    try:
+    change.is_confirm_unanswered = True
+    is_confirmed = False
+    with suppress(NodeRefused):
         deadman.confirm(connection, change.id, nonce=change.nonce, owner=change.ctx.run.owner)
-    except NodeRefused:
-        return False
-    return True
+        is_confirmed = True
+    change.is_confirm_unanswered = False
+    return is_confirmed
 
 
 def unlock(change: ChangeInProgress, connection: SshConnection) -> None:

@@ -186,6 +186,11 @@ def _resend(change: ChangeInProgress, connection: SshConnection, move: Action) -
     return None
 
 
+def unanswered_text(change: ChangeInProgress, consequence: str) -> str:
+    """A reason for a node that may have kept its change: the answer to its confirmation was lost."""
+    return f"it did not answer its confirmation ({change.last_error or 'interrupted'}): {consequence}"
+
+
 def _limit_s(change: ChangeInProgress) -> float:
     """The time within which the change is confirmed or rolled back."""
     return change.first_look_s + change.extra_s + change.window_s + GRACE_AFTER_WINDOW_S
@@ -204,7 +209,9 @@ def _uncertain(change: ChangeInProgress) -> Outcome:
     if change.started_s is None:
         # the node drops what it has staged or armed
         return Outcome(change.ctx.name, Result.FAILED, f"nothing was changed: {change.last_error or 'interrupted'}")
-    if change.ctx.run.interrupt.leaving:
+    if change.is_confirm_unanswered:
+        why = unanswered_text(change, "it keeps the change if that arrived; otherwise its timer rolls it back")
+    elif change.ctx.run.interrupt.leaving:
         why = f"interrupted during its change; it rolls back by itself within {change.window_s} s"
     else:
         why = f"unreachable since its change started ({change.last_error}); its timer has rolled it back"

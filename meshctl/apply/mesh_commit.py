@@ -30,7 +30,7 @@ from meshctl.apply.change_in_progress import (
     start,
     unlock,
 )
-from meshctl.apply.commit_confirm import GRACE_AFTER_WINDOW_S, poll
+from meshctl.apply.commit_confirm import GRACE_AFTER_WINDOW_S, poll, unanswered_text
 from meshctl.apply.context import NodeContext, RunContext
 from meshctl.apply.participant import (
     Participant,
@@ -292,7 +292,8 @@ def _prove(participant: Participant) -> None:
 
 
 def _confirm_all(commit: _MeshCommit) -> dict[str, Outcome]:
-    """Confirm the proven participants, and late ones until the window ends; the others roll back."""
+    """Confirm the proven participants, and late ones until the window ends; the others roll back. One that has not
+    answered its confirmation may have kept the change: it is asked again until its rollback would have ended, too."""
 
     def confirm_one(participant: Participant) -> None:
         if not participant.is_decided:
@@ -304,11 +305,15 @@ def _confirm_all(commit: _MeshCommit) -> dict[str, Outcome]:
         except NodeError as error:
             participant.change.last_error = str(error)
 
-    backoff = Backoff(commit.window_s * CONFIRM_SHARE, commit.run.interrupt)
-    while not backoff.is_over:
-        left = [p for p in commit.participants if not p.is_confirmed and not p.has_failed]
+    window_s = commit.window_s * CONFIRM_SHARE
+    backoff = Backoff(window_s + GRACE_AFTER_WINDOW_S, commit.run.interrupt)
+
+    def unconfirmed() -> list[Participant]:
+        return [p for p in commit.participants if p.awaits_confirm(is_window_over=backoff.elapsed_s > window_s)]
+
+    while (left := unconfirmed()) and not backoff.is_over:
         commit.each(left, confirm_one)
-        if all(p.is_confirmed or p.has_failed for p in left) or commit.run.interrupt.leaving:
+        if commit.run.interrupt.leaving or not unconfirmed():
             break
         backoff.pause()
     ended: dict[str, Outcome] = {}
@@ -330,6 +335,9 @@ def _confirmed_outcome(participant: Participant) -> Outcome:
         # it is where it was, so its way back can be observed
         change.is_abandoned = True
         return poll(change)
+    if change is not None and change.is_confirm_unanswered:
+        why = unanswered_text(change, "it is in the new cell if that arrived; otherwise it rolls back to the old one")
+        return Outcome(participant.name, Result.UNCERTAIN, why, hint="run `meshctl resume`, by cable if it is away")
     unmet = "; ".join(change.unmet) if change is not None and change.unmet else "it was not observed"
     return Outcome(
         participant.name,

@@ -51,6 +51,11 @@ class Participant:
     def leaves_cell(self) -> bool:
         return bool(self.ctx.plan.splits)
 
+    def awaits_confirm(self, *, is_window_over: bool) -> bool:
+        """Whether it may still be confirmed: after the window only if the answer to its confirmation may be lost."""
+        is_unanswered = self.change is not None and self.change.is_confirm_unanswered
+        return not (self.is_confirmed or self.has_failed) and (is_unanswered or not is_window_over)
+
     def decide(self, action: Action) -> None:
         """Take over what a look at the node showed. One in the new cell may still prove itself although its reload
         failed: given up too early, it would be left behind and need a cable."""
