@@ -2,10 +2,11 @@
 
 Datagrams pass between the nodes in batches, as from a driver with segmentation offload. Time is virtual: the nodes'
 CPU time is the only limit. Prints fragments/s and payload Mbit/s that one CPU core sustains on each side. With
-`--small`, messages of 10 B on 100 topics at 10,000 a second of virtual time, and the CPU time per message instead.
+`--small`, messages of 10 B on 100 topics at 10,000 a second of virtual time, and the CPU time per message instead. With
+`--away`, as many peers are out of reach meanwhile, and half of `limits.queue_bytes` waits for them.
 
     python benchmarks/core_throughput.py [--megabytes 200] [--profile sender|receiver]
-    python benchmarks/core_throughput.py --small
+    python benchmarks/core_throughput.py --small [--away 200]
 """
 
 from __future__ import annotations
@@ -17,8 +18,8 @@ import random
 import time
 
 from udp_mesh.core.endpoint import Endpoint
-from udp_mesh.core.events import MessageDelivered, MessageReceived
-from udp_mesh.core.settings import LinkInfo, LinkKind, Settings, Topic
+from udp_mesh.core.events import MessageDelivered, MessageReceived, Rejected
+from udp_mesh.core.settings import LinkInfo, LinkKind, Outbox, Settings, Topic
 from udp_mesh.crypto import Key
 
 ADDRESSES = {"a": ("10.0.0.1", 8700), "b": ("10.0.0.2", 8700)}
@@ -33,8 +34,15 @@ SMALL_TICK_S = 0.0005
 SMALL_PER_TICK = 5
 SMALL_MESSAGES = 100_000
 
+HELD_BYTES = (1_000_000, 1)
+"""Messages that fill half of `limits.queue_bytes` for peers that are away: large ones, then small ones until not even
+they fit."""
 
-TOPICS = (Topic("bulk"), *(Topic(f"small{number}", priority=5) for number in range(SMALL_TOPICS)))
+TOPICS = (
+    Topic("bulk"),
+    Topic("held", outbox=Outbox.ALL, outbox_bytes=1 << 30),
+    *(Topic(f"small{number}", priority=5) for number in range(SMALL_TOPICS)),
+)
 
 
 def make(name: str) -> Endpoint:
@@ -107,11 +115,20 @@ class Pair:
                 pstats.Stats(meter.profile).sort_stats("tottime").print_stats(30)
 
 
-def run_small() -> dict[str, float]:
-    """Send small messages; returns the CPU seconds of both sides together: to read the clock for each tick and side
-    would cost as much as some messages."""
+def fill_outboxes(node: Endpoint, away: int, now: float) -> None:
+    """Send to peers that are never heard until their shares of the memory are used up."""
+    for size in HELD_BYTES if away else ():
+        number, payload = 0, bytes(size)
+        while not isinstance(node.send("held", payload, destination=f"away{number % away}", now=now), Rejected):
+            number += 1
+
+
+def run_small(away: int) -> dict[str, float]:
+    """Send small messages while so many peers are away; returns the CPU seconds of both sides together: to read the
+    clock for each tick and side would cost as much as some messages."""
     pair = Pair(None)
     a, b = pair.nodes["a"], pair.nodes["b"]
+    fill_outboxes(a, away, pair.now)
     payload = bytes(SMALL_BYTES)
     delivered = received = sent = datagrams = 0
     began_s = time.process_time()
@@ -177,10 +194,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--megabytes", type=int, default=200)
     parser.add_argument("--small", action="store_true", help="small messages instead of a bulk transfer")
+    parser.add_argument("--away", type=int, default=0, metavar="PEERS", help="peers out of reach, with --small")
     parser.add_argument("--profile", choices=("sender", "receiver"))
     arguments = parser.parse_args()
     if arguments.small:
-        result = run_small()
+        result = run_small(arguments.away)
         each_us = 1e6 * result["seconds"] / result["messages"]
         print(f"{result['messages']:.0f} messages of {SMALL_BYTES} B in {result['datagrams']:.0f} datagrams")
         print(f"{each_us:.2f} us/message, both sides together")

@@ -146,6 +146,14 @@ def status_view(status: Json) -> str:
         for refusal in status["refusals"]
     ]
     lines += ["", peers_view(conditions["peers"])]
+    mtus = {link["name"]: link["mtu"] for link in status["links"]}
+    lines += [
+        f"the path to {peer['name']} carries packets of {peer['path_mtu_bytes']} bytes at most, link {peer['link']} "
+        f"{mtus[peer['link']]}"
+        for peer in conditions["peers"]
+        # Daemons of earlier versions do not tell; a relayed path has no link of its own.
+        if peer.get("path_mtu_bytes") and peer["path_mtu_bytes"] < mtus.get(peer["link"], 0)
+    ]
     radio = conditions.get("radio")
     if radio and radio["problem"]:
         lines.append(f"RADIO: {radio['problem']}")

@@ -206,6 +206,8 @@ class NackRepair:
                 at = now + NACK_DELAY_S * (0.5 + self._rng.random())
                 self._missing[number] = (at, 0)
                 self.next_at = min(self.next_at, at)
+        while len(self._missing) > MAX_MISSING:
+            del self._missing[next(iter(self._missing))]
         self._expected = next_number
 
     def on_received(self, number: int, now: float, received: RangeSet) -> None:

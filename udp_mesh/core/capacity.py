@@ -1,7 +1,6 @@
 """Whether a message may be accepted: the limits on what waits, for one peer and for all together."""
 
 from udp_mesh.core.events import Rejected, RejectReason
-from udp_mesh.core.peers.session import Peer
 from udp_mesh.core.sender.send_memory import COPY_BYTES, with_urgent_extra
 from udp_mesh.core.settings import Outbox, Topic
 from udp_mesh.core.state import State
@@ -47,22 +46,12 @@ def _check_memory(state: State, topic: Topic, names: list[str], size_bytes: int,
         )
     if urgent or waiting + size_bytes <= memory.limit // 2:
         return None
-    peers = state.peer_table.peers
-    share = memory.share(sum(1 for peer in peers.values() if _waiting_bytes(state, peer)))
-    for peer in [peers[name] for name in names if name in peers] if names else state.peer_table.online():
-        if _waiting_bytes(state, peer) + size_bytes > share:
+    share = memory.share()
+    for name in names or [peer.name for peer in state.peer_table.online()]:
+        if memory.waiting_bytes(name) + size_bytes > share:
             return Rejected(
                 RejectReason.QUEUE_FULL,
-                f"queue for {peer.name} is full: while more than half of limits.queue_bytes is used, "
+                f"queue for {name} is full: while more than half of limits.queue_bytes is used, "
                 f"each peer may use {share >> 20} MiB",
             )
     return None
-
-
-def _waiting_bytes(state: State, peer: Peer) -> int:
-    """What waits for one peer, overhead included."""
-    messages, size_bytes = state.outboxes.count(peer.name)
-    if peer.sender is not None:
-        messages += len(peer.sender.pending)
-        size_bytes += peer.sender.levels.queued_bytes
-    return size_bytes + messages * COPY_BYTES

@@ -89,6 +89,9 @@ class PeerConditions:
     capacity is unknown, or the peer is offline."""
     trend: Trend | None = None
     """Whether the link gets better or worse. None if too little was sent lately, or the peer is offline."""
+    path_mtu_bytes: int | None = None
+    """The largest IP packet that is sent to it: the MTU of the link, or what its path was found to carry. None if there
+    is no path, or the peer speaks the legacy format."""
 
 
 @dataclass(slots=True)

@@ -108,6 +108,7 @@ def _peer_conditions(state: State, peer: Peer, sender: Sender, via: tuple[str, .
         via,
         _available_bits_per_s(sender, capacity_bits_per_s, now) if peer.online else None,
         peer.trend.trend if peer.online and peer.trend is not None else None,
+        session.path.mtu if session is not None and session.path.link else None,
     )
 
 

@@ -124,12 +124,12 @@ class Outboxes:
         queue.put(new)
         self.bytes += new.size
         self._messages += 1
-        self._memory.add(accepted)
+        self._memory.add(peer, accepted)
         dropped: list[tuple[HeldMessage, ExpiryReason]] = []
         last = topic.outbox is Outbox.LAST
         while queue.messages > 1 if last else queue.bytes > topic.outbox_bytes:
             oldest = queue.front()
-            self._drop(queue, oldest)
+            self._drop(peer, queue, oldest)
             dropped.append((oldest, ExpiryReason.SUPERSEDED if last else ExpiryReason.OUTBOX_FULL))
         if not new.dropped:
             if not self.on_disk(new.store_key):
@@ -154,7 +154,7 @@ class Outboxes:
                 queue = level[place]
                 held = queue.front()
                 queue.held.popleft()
-                self._remove(queue, held)
+                self._remove(peer, queue, held)
                 released.append(held)
                 if queue.messages:
                     heappush(heads, (queue.front().accepted.message_id, place))
@@ -182,7 +182,7 @@ class Outboxes:
         while self._deadlines and (self._deadlines[0][0] <= now or self._deadlines[0][3].dropped):
             _, _, peer, held = heappop(self._deadlines)
             if not held.dropped:
-                self._drop(self._held[peer][held.accepted.channel.topic.name], held)
+                self._drop(peer, self._held[peer][held.accepted.channel.topic.name], held)
                 late.append((peer, held))
         return late
 
@@ -195,8 +195,8 @@ class Outboxes:
             for held in queue.held
             if not held.dropped
         ]
-        for _, held in everything:
-            self._memory.remove(held.accepted)
+        for peer, held in everything:
+            self._memory.remove(peer, held.accepted)
         self._held.clear()
         self._deadlines.clear()
         self.bytes = self._messages = 0
@@ -210,15 +210,15 @@ class Outboxes:
         queues = self._held.get(peer, {}).values()
         return sum(queue.messages for queue in queues), sum(queue.bytes for queue in queues)
 
-    def _drop(self, queue: _TopicQueue, held: HeldMessage) -> None:
-        self._remove(queue, held)
+    def _drop(self, peer: str, queue: _TopicQueue, held: HeldMessage) -> None:
+        self._remove(peer, queue, held)
         self.forget(held.store_key)
 
-    def _remove(self, queue: _TopicQueue, held: HeldMessage) -> None:
+    def _remove(self, peer: str, queue: _TopicQueue, held: HeldMessage) -> None:
         queue.drop(held)
         self.bytes -= held.size
         self._messages -= 1
-        self._memory.remove(held.accepted)
+        self._memory.remove(peer, held.accepted)
 
     def _note_deadline(self, peer: str, held: HeldMessage) -> None:
         deadline = held.accepted.deadline

@@ -36,6 +36,7 @@ _PEER_GAUGES = (
     ("peer_sends_bits_per_second", "Wire bits the peer reports as sent.", lambda peer: peer.peer_sends_bits_per_s),
     ("peer_capacity_bits_per_second", "Estimated link capacity.", lambda peer: peer.capacity_bits_per_s),
     ("peer_window_packets", "Congestion window in packets.", lambda peer: peer.window_packets),
+    ("peer_path_mtu_bytes", "Largest IP packet sent to the peer.", lambda peer: peer.path_mtu_bytes),
     ("peer_in_flight_packets", "Packets in flight.", lambda peer: float(peer.in_flight_packets)),
     ("peer_outbox_messages", "Messages stored for the offline peer.", lambda peer: float(peer.outbox_messages)),
     ("peer_outbox_bytes", "Bytes stored for the offline peer.", lambda peer: float(peer.outbox_bytes)),

@@ -14,10 +14,12 @@ import random
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
 
 from tests.udp_mesh.core.fuzzed_nodes import FuzzedLine, FuzzedLogs, FuzzedMessages, FuzzedRelay
+from tests.udp_mesh.core.hostile_peer import HostilePeer
 from tests.udp_mesh.core.pair import Pair, pair, settings
 from tests.udp_mesh.core.thin.fleet import RADIO, ThinFleet
 from tests.udp_mesh.wire.make_vectors import FRAMES, LEGACY, MESH_DATA
@@ -39,7 +41,7 @@ FRESH_PAIR_EVERY = 20_000
 """Inputs after which both nodes are replaced: growth shows by then, and stuck state does not hide other failures."""
 TIMERS_EVERY = 200
 MAX_PARTIAL_BYTES, MAX_PEERS, MAX_STRANGERS = 2_000_000, 64, 16
-
+Running = FuzzedRelay | FuzzedLogs | FuzzedMessages | HostilePeer
 LEGACY_ADDRESS = ("10.0.0.9", 8700)
 SOURCES = (("mesh", ("10.0.0.66", 8700)), ("six", ("fe80::66", 8700)), ("mesh", ("10.0.0.1", 8700)))
 _BOUNDARIES = bytes((0, 1, 0x7F, 0x80, 0xFF))
@@ -52,33 +54,30 @@ class Fuzzer:
         self.rng = random.Random(seed)
         self.inputs = 0
         self.seeds = [encode(frames) for frames in FRAMES.values()]
-        self.legacy_seeds = [encode_legacy(datagram) for datagram in LEGACY.values()]
-        self.legacy_seeds += fragment_legacy(encode_mesh_data(MESH_DATA))
+        self.legacy_seeds = [*map(encode_legacy, LEGACY.values()), *fragment_legacy(encode_mesh_data(MESH_DATA))]
         self.pair = self._new_pair()
         self.thin = self._new_thin()
-        # Made where their surfaces are run: to let them meet takes longer than most other surfaces.
-        self._relay: FuzzedRelay | None = None
-        self._logs: FuzzedLogs | None = None
-        self._messages: FuzzedMessages | None = None
         self.line = FuzzedLine()
 
-    @property
+    # Made where their surfaces are run: to let them meet takes longer than most other surfaces.
+    @cached_property
     def relay(self) -> FuzzedRelay:
-        if self._relay is None:
-            self._relay = FuzzedRelay(self.rng.getrandbits(32))
-        return self._relay
+        return FuzzedRelay(self.rng.getrandbits(32))
 
-    @property
+    @cached_property
     def logs(self) -> FuzzedLogs:
-        if self._logs is None:
-            self._logs = FuzzedLogs(self.rng.getrandbits(32))
-        return self._logs
+        return FuzzedLogs(self.rng.getrandbits(32))
 
-    @property
+    @cached_property
     def messages(self) -> FuzzedMessages:
-        if self._messages is None:
-            self._messages = FuzzedMessages(self.rng.getrandbits(32))
-        return self._messages
+        return FuzzedMessages(self.rng.getrandbits(32))
+
+    @cached_property
+    def hostile(self) -> HostilePeer:
+        return HostilePeer(self.rng.getrandbits(32))
+
+    def _running(self) -> dict[str, Running]:
+        return {name: value for name, value in vars(self).items() if isinstance(value, Running)}
 
     def _new_thin(self) -> ThinFleet:
         fleet = ThinFleet("a", "b", seed=self.rng.getrandbits(32))
@@ -143,14 +142,14 @@ class Fuzzer:
                 self.check_bounds()
                 self.pair = self._new_pair()
                 self.thin = self._new_thin()
-                self._relay, self._logs, self._messages = None, None, None
+                for name in self._running():
+                    delattr(self, name)
 
     def _let_nodes_work(self) -> None:
         self.pair.now += 0.05
         self.thin.run(0.05)
-        for running in (self._relay, self._logs, self._messages):
-            if running is not None:
-                running.run(0.05)
+        for running in self._running().values():
+            running.run(0.05)
         for node in (self.pair.b, self.pair.a):
             node.handle_timer(self.pair.now)
             while node.datagrams_to_send(self.pair.now):
@@ -160,9 +159,8 @@ class Fuzzer:
 
     def check_bounds(self) -> None:
         """Raises AssertionError if the node holds more than its limits allow."""
-        for running in (self._relay, self._logs, self._messages):
-            if running is not None:
-                running.check_bounds()
+        for running in self._running().values():
+            running.check_bounds()
         thin = self.thin.thin("b")
         assert len(thin.reassembly) <= MAX_PARTIALS
         assert len(thin.peers.peers) <= MAX_THIN_NUMBER
@@ -210,8 +208,7 @@ def mutated_datagrams(fuzzer: Fuzzer) -> None:
 
 
 def legacy(fuzzer: Fuzzer) -> None:
-    seeds = fuzzer.legacy_seeds
-    data = fuzzer.mutated(seeds[fuzzer.rng.getrandbits(16) % len(seeds)])
+    data = fuzzer.mutated(fuzzer.rng.choice(fuzzer.legacy_seeds))
     fuzzer.pair.b.receive(data, "mesh", LEGACY_ADDRESS, fuzzer.pair.now)
 
 
@@ -273,6 +270,11 @@ def serial_lines(fuzzer: Fuzzer) -> None:
         fuzzer.receive_thin(frame)
 
 
+def hostile_frames(fuzzer: Fuzzer) -> None:
+    """Frames of a key holder that are well-formed and say anything."""
+    fuzzer.hostile.receive()
+
+
 def relay_frames(fuzzer: Fuzzer) -> None:
     """A key holder's frames between relays, to one neighbor and to all."""
     seeds, bits = fuzzer.relay.seeds, fuzzer.rng.getrandbits(16)
@@ -295,6 +297,7 @@ SURFACES = {
         decoder,
         sealed_data,
         sealed_to_all,
+        hostile_frames,
         mutated_datagrams,
         legacy,
         subscriptions,

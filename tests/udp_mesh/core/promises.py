@@ -29,6 +29,7 @@ from udp_mesh.core.receiver.reassembly import RELIABLE_TIMEOUT_S
 from udp_mesh.core.sender.message import OutgoingMessage
 from udp_mesh.core.sender.path import Path
 from udp_mesh.core.sender.rate_limit import TokenBucket
+from udp_mesh.core.sender.send_memory import COPY_BYTES
 from udp_mesh.core.sender.send_state import SendState
 from udp_mesh.core.sender.sender import Sender
 from udp_mesh.core.sender.sent_packets import Packet, SentPackets
@@ -78,20 +79,26 @@ def check_node(team: RandomTeam, name: str) -> None:
 
 def check_memory(name: str, state: State) -> None:
     """The memory of what waits for all peers is what is in their queues and outboxes."""
-    waiting = [message.accepted for peer in state.peer_table.peers.values() for message in _pending(peer)]
+    waiting = [(peer.name, message.accepted) for peer in state.peer_table.peers.values() for message in _pending(peer)]
     waiting += [
-        held.accepted
-        for queues in state.outboxes._held.values()
+        (peer, held.accepted)
+        for peer, queues in state.outboxes._held.items()
         for queue in queues.values()
         for held in queue.held
         if not held.dropped
     ]
-    copies = Counter(accepted.message_id for accepted in waiting)
-    counted = {number: found[0] for number, found in state.peer_table.send_memory._messages.items()}
+    memory = state.peer_table.send_memory
+    copies = Counter(accepted.message_id for _, accepted in waiting)
+    counted = {number: found[0] for number, found in memory._messages.items()}
     if copies != counted:
         raise Broken(f"{name} counts {counted} as waiting, and has {copies}")
-    if not counted and state.peer_table.send_memory.bytes:
-        raise Broken(f"{name} counts {state.peer_table.send_memory.bytes} B although nothing waits")
+    by_peer: Counter[str] = Counter()
+    for peer, accepted in waiting:
+        by_peer[peer] += memory._messages[accepted.message_id][1] + COPY_BYTES
+    if by_peer != memory._by_peer:
+        raise Broken(f"{name} counts {memory._by_peer} B as waiting for each peer, and has {dict(by_peer)}")
+    if not counted and memory.bytes:
+        raise Broken(f"{name} counts {memory.bytes} B although nothing waits")
 
 
 def _pending(peer: Peer) -> list[OutgoingMessage]:

@@ -8,6 +8,7 @@ from collections.abc import Callable
 import pytest
 
 from tests.udp_mesh.core.pair import BROADCAST, World, pair, settings
+from udp_mesh.core.broadcast import MAX_MISSING, NackRepair
 from udp_mesh.core.events import (
     ExpiryReason,
     MessageDelivered,
@@ -19,6 +20,7 @@ from udp_mesh.core.events import (
     RejectReason,
 )
 from udp_mesh.core.interfaces import Datagram, StoredMessage
+from udp_mesh.core.ranges import RangeSet
 from udp_mesh.core.settings import Outbox, Rates, Topic
 
 TEAM = ("a", "b", "c", "d")
@@ -262,3 +264,11 @@ def test_an_outbox_delivers_to_a_peer_first_met_after_the_send() -> None:
         pipe.up = True
     assert world.run(20.0, until=lambda: bool(world.events_of("scout", MessageDelivered)))
     assert payloads(world, "base") == [data]
+
+
+def test_a_sender_whose_numbers_keep_jumping_ahead_causes_few_requests() -> None:
+    repairs = NackRepair(random.Random(1))
+    for jump in range(100):
+        repairs.on_counter(1000 * jump, 0.0, RangeSet())
+    requested = [nack.message_id for nack in repairs.due_nacks(1.0)]
+    assert requested == list(range(99_000 - MAX_MISSING, 99_000))

@@ -17,6 +17,7 @@ from tests.udp_mesh.core.fuzzing import (
     SURFACES,
     Chunk,
     Fuzzer,
+    hostile_frames,
     legacy,
     log_messages,
     mutated_datagrams,
@@ -50,12 +51,13 @@ def test_a_pair_still_communicates_after_fuzzed_input() -> None:
 
 def test_running_nodes_still_work_after_fuzzed_input() -> None:
     fuzzer = Fuzzer(seed=78)
-    for surface in (relay_frames, log_messages, subscriptions, versions):
+    for surface in (relay_frames, log_messages, subscriptions, versions, hostile_frames):
         fuzzer.run(surface, 1000)
     fuzzer.check_bounds()
     assert fuzzer.relay.works()
     assert fuzzer.logs.works()
     assert fuzzer.messages.works()
+    assert fuzzer.hostile.works()
 
 
 def test_fuzzed_input_gets_past_what_drops_it_early() -> None:

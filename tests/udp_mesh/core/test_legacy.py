@@ -119,6 +119,9 @@ def test_messages_of_a_legacy_peer_arrive_and_are_acknowledged() -> None:
     acks = [answer for answer in old.hear() if isinstance(answer, LegacyAck)]
     assert {(ack.sequence, ack.position) for ack in acks} == {(5, 0), (5, 1), (5, 2), (5, 3)}
     (event,) = old.received()
+    assert old.node.conditions(old.now).counters.messages_received == 1
+    # Nothing authenticates them: they and the heartbeat count toward a flood.
+    assert old.node.unauthenticated == 5
     assert (event.source, event.topic, event.payload, event.priority) == ("old", "chat", b"x" * 4000, 4)
 
 
@@ -299,6 +302,15 @@ def test_defect_7_each_partial_message_is_purged_by_its_own_age() -> None:
     assert len(reassembly) == 1
     _, whole = reassembly.add(fragments(2, bytes(2000))[1], 11.0)
     assert whole is not None
+
+
+def test_nothing_is_held_of_a_complete_or_purged_message() -> None:
+    reassembly = LegacyReassembly(Limits())
+    for fragment in (*fragments(1, bytes(2000)), fragments(2, bytes(2000))[0]):
+        reassembly.add(fragment, 0.0)
+    assert reassembly.bytes > 0
+    reassembly.purge(11.0)
+    assert reassembly.bytes == 0
 
 
 def test_defect_8_a_reused_sequence_number_is_not_merged_with_an_old_partial_message() -> None:

@@ -4,7 +4,9 @@ import heapq
 import random
 
 from tests.udp_mesh.core.legacy_program import LegacyProgram
-from tests.udp_mesh.core.test_legacy import OldRobot
+from tests.udp_mesh.core.test_legacy import OldRobot, fragments
+from udp_mesh.core.events import Event, MessagePeerLost, PeerOffline
+from udp_mesh.core.settings import Rates
 from udp_mesh.wire.legacy import LegacyAck, LegacyPayload
 
 DELAY_S, LOSS, TICK_S = 0.010, 0.2, 0.001
@@ -68,3 +70,35 @@ def test_a_legacy_peer_that_answered_and_fell_silent_is_probed_gently() -> None:
         fragments = [fragment for fragment in old.hear() if isinstance(fragment, LegacyPayload)]
         left += len(fragments) if old.now > silent_from else 0
     assert 30 <= left <= 60
+
+
+def test_after_a_loss_acknowledgements_are_repeated_once_more_for_ten_seconds() -> None:
+    old = OldRobot()
+
+    def acknowledgements(fragment: LegacyPayload) -> int:
+        """How often this fragment is acknowledged within a second."""
+        old.say(fragment)
+        found = 0
+        for _ in range(100):
+            found += old.hear().count(LegacyAck(fragment.sequence, fragment.position))
+            old.now += 0.01
+        return found
+
+    first, _, third, _ = fragments(5, bytes(4000))
+    old.say(first)
+    old.say(third)
+    old.now += 8.0
+    assert acknowledgements(fragments(6, b"x")[0]) == 3
+    old.now += 3.0
+    assert acknowledgements(fragments(7, b"x")[0]) == 2
+
+
+def test_what_waits_for_a_legacy_robot_that_is_lost_ends() -> None:
+    old = OldRobot(rates=Rates(offline_s=3.0, peer_lost_s=6.0))
+    old.node.send("map", b"x", destination="old", now=old.now)
+    found: list[Event] = []
+    for _ in range(80):
+        old.hear()
+        found += old.events()
+        old.now += 0.1
+    assert [type(event) for event in found] == [PeerOffline, MessagePeerLost]

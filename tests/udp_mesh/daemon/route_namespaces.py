@@ -17,6 +17,7 @@ from pathlib import Path
 from tests.udp_mesh.daemon.namespaces import Pair, logged, met, under_way
 from tests.udp_mesh.daemon.processes import KEY, RATES, collect, outcomes
 from tests.udp_mesh.daemon.veth_links import isolated_daemon
+from udp_mesh.cli.views import status_view
 
 NARROW_MTU = 1280
 TOPICS = """
@@ -101,13 +102,16 @@ def route() -> Iterator[Route]:
 
 
 def narrow_from_the_start() -> None:
-    """Messages arrive both ways, and each end finds the MTU rather than the next lower one."""
+    """Messages arrive both ways, and each end finds the MTU rather than the next lower one, and shows it."""
     with route() as narrow:
         narrow.narrow()
         met(narrow.both)
         narrow.both.exchange()
-        for daemon in (narrow.both.alice, narrow.both.bob):
+        for daemon, peer in ((narrow.both.alice, "bob"), (narrow.both.bob, "alice")):
             logged(daemon, f"mtu={NARROW_MTU} ")
+            with daemon.client() as client:
+                page = status_view(client.request("status"))
+            assert f"the path to {peer} carries packets of {NARROW_MTU} bytes at most, link " in page
 
 
 def narrows_in_the_middle() -> None:
@@ -119,6 +123,7 @@ def narrows_in_the_middle() -> None:
             receiver.subscribe("map")
             sender.publish("map", bytes(MAP_BYTES), to="bob", notify=True)
             under_way(both.alice, 300)
+            assert "the path to" not in status_view(sender.request("status"))
             narrowing.narrow()
             (message,) = collect(receiver, 1)
             assert message.payload == bytes(MAP_BYTES)

@@ -14,7 +14,7 @@ from udp_mesh.daemon.bulk_ticks import LATE_EXCESS, MARKED_VALID_S, MAX_DATAGRAM
 from udp_mesh.links.udp import UdpLink
 
 
-class _Loop:
+class ManualLoop:
     """A loop with a clock that the test sets."""
 
     def __init__(self) -> None:
@@ -48,7 +48,7 @@ class _Reading:
 
     def __init__(self, link: UdpLink) -> None:
         self.link = link
-        self.loop = _Loop()
+        self.loop = ManualLoop()
         self.late_acknowledgements = 0
         loop = cast("asyncio.AbstractEventLoop", self.loop)
         self.ticks = BulkTicks(loop, self, self._read, self._after_read)

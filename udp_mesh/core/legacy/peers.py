@@ -16,7 +16,7 @@ from udp_mesh.core.legacy.acks import LegacyAcks, ReceivePosition
 from udp_mesh.core.legacy.reassembly import LegacyReassembly
 from udp_mesh.core.legacy.sender import LegacySender
 from udp_mesh.core.peers.peer_state import PeerEvent, PeerState
-from udp_mesh.core.peers.session import Meters, Peer
+from udp_mesh.core.peers.session import STALE_PATH_S, Meters, Peer
 from udp_mesh.core.publish import release_outbox, report_ended, store_in_outbox
 from udp_mesh.core.sender.path import IP_UDP_BYTES
 from udp_mesh.core.sender.pending import Outcome
@@ -60,8 +60,10 @@ class LegacyPeer:
         "broadcasts",
         "last_heard",
         "link",
+        "link_heard_at",
         "meters",
         "neighbour",
+        "own_host",
         "peer",
         "received_bytes",
         "sender",
@@ -82,6 +84,9 @@ class LegacyPeer:
         self.peer = peer
         self.address = neighbour.address
         self.link = neighbour.link or ""
+        self.link_heard_at = float("-inf")
+        self.own_host: str | None = None
+        """The address of ours that fragments were last sent from."""
         self.sender = LegacySender(peer.open_sender(), settings.name, rng.getrandbits(15))
         self.unicasts = LegacyReassembly(settings.limits)
         self.broadcasts = LegacyReassembly(settings.limits)
@@ -179,7 +184,11 @@ class LegacyPeers:
             legacy.settled_at = now + SETTLE_S
             legacy.peer.settling = True
         legacy.last_heard = now
-        legacy.link = link
+        if link != legacy.link and legacy.link in self._state.links and now - legacy.link_heard_at < STALE_PATH_S:
+            # Its broadcasts may come over several links, but it knows us by the address that we send from.
+            link = legacy.link
+        else:
+            legacy.link, legacy.link_heard_at = link, now
         legacy.address = source
         legacy.sender.on_activity()
         peer = legacy.peer
@@ -246,8 +255,19 @@ class LegacyPeers:
         """Send the fragments that may be sent now."""
         for legacy in self._active():
             if legacy.link and (legacy.peer.open_sender().pending or legacy.sender.timer() is not None):
+                self._follow_own_address(legacy, now)
                 legacy.sender.send(legacy.link, legacy.address, now, out)
                 report_ended(self._state, legacy.peer, now)
+
+    def _follow_own_address(self, legacy: LegacyPeer, now: float) -> None:
+        """Restart what is under way once our address is another one: the legacy program takes us for another robot, and
+        never completes a message of which it has some fragments from the old address."""
+        link = self._state.links.get(legacy.link)
+        if link is None:
+            return
+        if legacy.own_host not in (None, link.address[0]):
+            legacy.peer.open_sender().restart(now)
+        legacy.own_host = link.address[0]
 
     def next_at(self) -> float:
         """When `handle_timer` is due."""

@@ -138,7 +138,7 @@ class Peer:
     def open_sender(self) -> Sender:
         """The sender, created if there is none yet."""
         if self.sender is None:
-            self.sender = Sender(self._settings, self._memory)
+            self.sender = Sender(self._settings, self._memory, self.name)
             self.trend = LinkTrend()
         return self.sender
 

@@ -200,18 +200,17 @@ class Reassembly:
         self.bytes += size + FRAGMENT_OVERHEAD_BYTES
         return True
 
-    def forget(self, message_id: int) -> bool:
-        """Drop an unfinished message. False if there is none."""
+    def forget(self, message_id: int) -> None:
+        """Drop an unfinished message, if there is one."""
         partial = self._partials.pop(message_id, None)
         if partial is None:
-            return False
+            return
         self.bytes -= partial.bytes + FRAGMENT_OVERHEAD_BYTES * len(partial.payloads)
         self._account.release(PARTIAL_BYTES)
         spare = self._reserved - self.bytes
         if spare >= 2 * RESERVE_STEP_BYTES or not self.bytes:
             self._reserved = self.bytes
             self._account.release(spare)
-        return True
 
     def _reserve(self, more: int) -> bool:
         """Whether `more` bytes may be held."""
@@ -256,21 +255,6 @@ class Reassembly:
                 and not partial.head.flags & MessageFlag.RELIABLE
             ):
                 self.end(message_id)
-
-    def missing(self, message_id: int) -> list[tuple[int, int]] | None:
-        """(first, count) of the missing positions. None if the message is unknown."""
-        partial = self._partials.get(message_id)
-        if partial is None or partial.head is None:
-            return None
-        gaps: list[tuple[int, int]] = []
-        expected = 0
-        for position in sorted(partial.payloads):
-            if position > expected:
-                gaps.append((expected, position - expected))
-            expected = position + 1
-        if expected < partial.head.fragments:
-            gaps.append((expected, partial.head.fragments - expected))
-        return gaps
 
     def _finish(self, message_id: int) -> None:
         closed_to = self._remember(self.finished, message_id)

@@ -52,13 +52,14 @@ class LevelStats:
 
 class PriorityLevels:
     """One `LevelStats` per priority. `queued_bytes` is the total pending on all levels; `memory` counts what is pending
-    for all peers."""
+    for all peers, this one's under the name `peer`."""
 
-    __slots__ = ("_levels", "_memory", "queued_bytes")
+    __slots__ = ("_levels", "_memory", "_peer", "queued_bytes")
 
-    def __init__(self, memory: SendMemory) -> None:
+    def __init__(self, memory: SendMemory, peer: str) -> None:
         self._levels = [LevelStats() for _ in range(PRIORITY_LEVELS)]
         self._memory = memory
+        self._peer = peer
         self.queued_bytes = 0
 
     def __getitem__(self, priority: int) -> LevelStats:
@@ -74,7 +75,7 @@ class PriorityLevels:
         level.messages += 1
         level.bytes += size
         self.queued_bytes += size
-        self._memory.add(message.accepted)
+        self._memory.add(self._peer, message.accepted)
         self._append(level, message)
 
     def append(self, message: OutgoingMessage) -> None:
@@ -89,7 +90,7 @@ class PriorityLevels:
     def remove(self, message: OutgoingMessage) -> None:
         """Stop counting a message that ended."""
         self._count(message, -1)
-        self._memory.remove(message.accepted)
+        self._memory.remove(self._peer, message.accepted)
 
     def _count(self, message: OutgoingMessage, sign: int) -> None:
         level = self._levels[message.priority]

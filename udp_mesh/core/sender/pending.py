@@ -56,10 +56,10 @@ class Unconfirmed:
 class PendingMessages:
     """The session fetches and clears `ended` and `cancelled`."""
 
-    def __init__(self, memory: SendMemory) -> None:
+    def __init__(self, memory: SendMemory, peer: str) -> None:
         self.pending: dict[OutgoingMessage, None] = {}
         """Messages without an outcome, in the order accepted."""
-        self.levels = PriorityLevels(memory)
+        self.levels = PriorityLevels(memory, peer)
         self.ended: list[Ended] = []
         self.cancelled: list[int] = []
         """Wire ids abandoned after their first fragment was sent: the peer may discard them."""

@@ -25,18 +25,21 @@ def with_urgent_extra(limit: int, *, urgent: bool) -> int:
 
 
 class SendMemory:
-    """Only counts: queues and outboxes call `add` and `remove`."""
+    """Only counts: queues and outboxes call `add` and `remove`, each at a cost that does not depend on the number of
+    peers."""
 
-    __slots__ = ("_messages", "bytes", "limit")
+    __slots__ = ("_by_peer", "_messages", "bytes", "limit")
 
     def __init__(self, limit: int) -> None:
         self.limit = limit
         self.bytes = 0
         self._messages: dict[MessageId, tuple[int, int]] = {}
         """Number of copies, and bytes of the message itself."""
+        self._by_peer: dict[str, int] = {}
+        """Bytes that wait for each peer, overhead included; only peers that something waits for."""
 
-    def add(self, accepted: AcceptedMessage) -> None:
-        """Count one copy."""
+    def add(self, peer: str, accepted: AcceptedMessage) -> None:
+        """Count the copy for one peer."""
         found = self._messages.get(accepted.message_id)
         if found is None:
             size = len(accepted.payload)
@@ -45,11 +48,13 @@ class SendMemory:
             self._messages[accepted.message_id] = (1, size)
             self.bytes += size + COPY_BYTES
         else:
-            self._messages[accepted.message_id] = (found[0] + 1, found[1])
+            size = found[1]
+            self._messages[accepted.message_id] = (found[0] + 1, size)
             self.bytes += COPY_BYTES
+        self._by_peer[peer] = self._by_peer.get(peer, 0) + size + COPY_BYTES
 
-    def remove(self, accepted: AcceptedMessage) -> None:
-        """Stop counting one copy."""
+    def remove(self, peer: str, accepted: AcceptedMessage) -> None:
+        """Stop counting the copy for one peer."""
         copies, size = self._messages[accepted.message_id]
         if copies == 1:
             del self._messages[accepted.message_id]
@@ -57,7 +62,16 @@ class SendMemory:
         else:
             self._messages[accepted.message_id] = (copies - 1, size)
             self.bytes -= COPY_BYTES
+        left = self._by_peer[peer] - size - COPY_BYTES
+        if left:
+            self._by_peer[peer] = left
+        else:
+            del self._by_peer[peer]
 
-    def share(self, holders: int) -> int:
-        """What each of so many peers may hold in the second half of the budget."""
-        return self.limit // 2 // max(1, holders)
+    def waiting_bytes(self, peer: str) -> int:
+        """What waits for one peer, in its queue and its outboxes, overhead included."""
+        return self._by_peer.get(peer, 0)
+
+    def share(self) -> int:
+        """What each peer that something waits for may hold in the second half of the budget."""
+        return self.limit // 2 // max(1, len(self._by_peer))

@@ -53,10 +53,11 @@ STALE_AFTER_S = 1.0
 
 
 class Sender(PendingMessages):
-    """The sending half of a session. Times in seconds. `memory` counts what waits for all peers together."""
+    """The sending half of a session. Times in seconds. `memory` counts what waits for all peers together,
+    for this one under the name `peer`."""
 
-    def __init__(self, settings: Settings, memory: SendMemory | None = None) -> None:
-        super().__init__(memory or SendMemory(settings.limits.queue_bytes))
+    def __init__(self, settings: Settings, memory: SendMemory | None = None, peer: str = "") -> None:
+        super().__init__(memory or SendMemory(settings.limits.queue_bytes), peer)
         self.rtt = RttEstimator()
         self.urgent_rtt = RttEstimator()
         """Of urgent packets only: in a radio's queues they overtake others (Wi-Fi access categories)."""

@@ -2,7 +2,7 @@
 
 import pytest
 
-from udp_mesh.core.receiver.memory_limit import Account, MemoryBudget
+from udp_mesh.core.receiver.memory_limit import PARTIAL_BYTES, Account, MemoryBudget
 from udp_mesh.core.receiver.reassembly import (
     BEST_EFFORT_TIMEOUT_S,
     MAX_EXPIRED_REMEMBERED,
@@ -69,6 +69,20 @@ def test_what_was_reserved_for_a_message_is_released_with_it() -> None:
     assert account.bytes > 0
     reassembly.forget(7)
     assert account.bytes == 0
+
+
+def test_where_no_whole_step_is_left_a_fragment_takes_what_it_needs() -> None:
+    memory = MemoryBudget(100_000)
+    reassembly = Reassembly(Limits(), Account(memory))
+    payload = bytes(10_000)
+    results = [reassembly.add(Fragment(1, place, payload, None), 0.0) for place in range(1, 11)]
+    kept = results.count(FragmentStatus.KEPT)
+    assert 0 < kept < 10
+    assert results[kept:] == [FragmentStatus.FULL] * (10 - kept)
+    assert memory.bytes == PARTIAL_BYTES + reassembly.bytes <= 50_000
+    assert memory.bytes + len(payload) > 50_000
+    reassembly.forget(1)
+    assert memory.bytes == 0
 
 
 def test_only_so_many_expired_messages_are_remembered() -> None:

@@ -94,6 +94,7 @@ def test_a_large_message_crosses_a_path_with_an_mtu_below_the_link_mtu(
     assert narrow(world) == found
     world.run(5.0)
     assert topics(world, "b", MessageReceived).count("map") == 1
+    assert world.nodes["a"].conditions(world.now).peers[0].path_mtu_bytes == [1500, *found][-1]
 
 
 def largest_of(world: World) -> list[int]:

@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+import random
+
+from hypothesis import given
+from hypothesis import strategies as st
+
 from tests.udp_mesh.core.pair import World, settings
-from udp_mesh.core.events import MessageDelivered, Rejected, RejectReason
-from udp_mesh.core.sender.send_memory import SendMemory
+from udp_mesh.core.events import MessageDelivered, MessageId, Rejected, RejectReason
+from udp_mesh.core.sender.message import AcceptedMessage, TopicChannel
+from udp_mesh.core.sender.send_memory import COPY_BYTES, SendMemory
 from udp_mesh.core.settings import Limits, Outbox, Rates, Topic
 
 TOTAL = 1_000_000
@@ -129,3 +135,33 @@ def test_what_ends_without_being_sent_is_released() -> None:
     assert memory(world).bytes > 6 * SIZE
     world.nodes["a"].close(world.now)
     assert memory(world).bytes == 0
+
+
+COPIES = st.lists(st.tuples(st.sampled_from(PEERS), st.integers(0, 5)), max_size=60)
+"""Peer and message of each copy. Even messages are compressed: both forms are kept."""
+
+
+@given(COPIES, st.randoms())
+def test_the_counts_are_those_of_all_copies_added_up(copies: list[tuple[str, int]], rng: random.Random) -> None:
+    """Each copy is added once and removed once, in any order; after each step all of them are counted."""
+    channel = TopicChannel(0, TOPICS[1], "map", "")
+    payloads = [bytes(1000 + number) for number in range(6)]
+    bodies = [payload if number % 2 else payload[:100] for number, payload in enumerate(payloads)]
+    held_bytes = [1100, 1001, 1102, 1003, 1104, 1005]
+    counted, waiting = SendMemory(TOTAL), list[tuple[str, AcceptedMessage]]()
+    to_add = [
+        (peer, AcceptedMessage(MessageId(number), channel, payloads[number], bodies[number], 0, 0.0, None))
+        for peer, number in copies
+    ]
+    while to_add or waiting:
+        if to_add and (not waiting or rng.random() < 0.6):
+            waiting.append(to_add.pop())
+            counted.add(*waiting[-1])
+        else:
+            counted.remove(*waiting.pop(rng.randrange(len(waiting))))
+        messages = {accepted.message_id for _, accepted in waiting}
+        assert counted.bytes == sum(held_bytes[number] for number in messages) + COPY_BYTES * len(waiting)
+        for peer in PEERS:
+            theirs = [held_bytes[accepted.message_id] + COPY_BYTES for name, accepted in waiting if name == peer]
+            assert counted.waiting_bytes(peer) == sum(theirs)
+        assert counted.share() == TOTAL // 2 // max(1, len({peer for peer, _ in waiting}))

@@ -70,6 +70,9 @@ class Ether(threading.Thread):
         """By port: the UDP port that its datagrams leave with, as behind a NAT that lost its state."""
         self.datagrams: Counter[str] = Counter()
         """Sent by each port."""
+        self.unsealed: set[str] = set()
+        """Ports whose robots authenticate nothing: what goes to them or comes from them is neither damaged nor sent
+        again."""
         self.too_long: set[tuple[str, str]] = set()
         """Directions in which a datagram exceeded the path's MTU."""
         self.failure: Exception | None = None
@@ -179,11 +182,13 @@ class Ether(threading.Thread):
         if self._busy_until - now > MAX_QUEUE_S:
             self._busy_until -= len(frame) * 8 / self.rate_bits_per_s
             return
-        self._recorded.append((other, frame))
+        sealed = not {name, other} & self.unsealed
+        if sealed:
+            self._recorded.append((other, frame))
         self._sent.setdefault(name, deque(maxlen=RECORDED)).append(frame)
         for _ in range(2 if rng.random() < path.duplicates else 1):
             at = self._busy_until + path.delay_s + rng.random() * path.jitter_s
-            self._send_at(at, other, self._damaged(frame) if rng.random() < path.damage else frame)
+            self._send_at(at, other, self._damaged(frame) if sealed and rng.random() < path.damage else frame)
 
     def _translated(self, name: str, other: str, frame: bytes) -> bytes | None:
         """With the ports that a NAT gives; None if it does not know whom the datagram is for."""

@@ -50,6 +50,8 @@ class Sent:
     accepted_at: float | None = None
     ends: dict[str, str] = field(default_factory=dict)
     """Outcome by peer."""
+    ended_at: float | None = None
+    """When the last of them came."""
     abandoned: bool = False
     """Its program or daemon ended: nobody hears of its outcome."""
     readers: list[tuple[str, Reader, float]] = field(default_factory=list)

@@ -1,4 +1,4 @@
-"""One computer of a live team: namespace, interface, disk, clock and daemon."""
+"""One computer of a live team: namespace, interfaces, disk, clock and daemon."""
 
 from __future__ import annotations
 
@@ -6,10 +6,12 @@ import contextlib
 import signal
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 from tests.udp_mesh.daemon.live.ether import Ether
 from tests.udp_mesh.daemon.live.programs import Broken, Reader, Writer
+from tests.udp_mesh.daemon.live.radio import Radio, run
 from tests.udp_mesh.daemon.processes import KEY, RunningDaemon, poll
 
 TOPICS = """
@@ -34,8 +36,6 @@ NEVER_EXPIRE = ("stop", "stored", "limited", "map", "grid")
 """Topics without deadline, `keep_last` or small outbox: their messages only end as delivered, unwanted or with their
 peer lost."""
 DISK_BYTES = 40_000_000
-REFUSING_RULE = 10
-"""Preference of the routing rule that makes the kernel refuse to send."""
 PASSED_ON_S = 10.0
 """Between the acknowledgment and the program's socket lies one turn of a daemon, even on a busy machine."""
 RATES = """
@@ -47,30 +47,28 @@ peer_lost_s = 8.0
 """
 
 
-def run(command: str) -> None:
-    subprocess.run(command.split(), check=True)
-
-
 class Robot:
-    """One computer: a namespace, an interface, a disk and a daemon."""
+    """One computer: a namespace, an interface or two, a disk and a daemon."""
 
     def __init__(
         self,
         folder: Path,
         name: str,
         place: int,
-        ether: Ether,
+        ethers: Sequence[Ether],
         *,
         ipv6: bool = False,
         key: str = KEY,
         called: str = "",
         version: Path | None = None,
+        more: str = "",
     ) -> None:
-        """`version` is a checkout of another version, whose daemon runs here."""
-        self.name, self.ether, self.place, self.ipv6 = name, ether, place, ipv6
+        """`version` is a checkout of another version, whose daemon runs here; `more` is of its configuration."""
+        self.name, self.place = name, place
+        self.radios = [Radio(name, place, number, ether, ipv6=ipv6) for number, ether in enumerate(ethers)]
         self.called = called or name
         """What its daemon says it is called."""
-        self.host = place + 1
+        self.more = more
         self.runs = 0
         self.suspended = False
         self.reader: Reader | None = None
@@ -92,27 +90,18 @@ class Robot:
             self.daemon.prefix += ["env", "--chdir", str(version)]
 
     def attach(self) -> None:
-        """Make the interface, whose other end is a port of the ether."""
+        """Make the interfaces."""
         poll(self._has_namespace, f"a network namespace for {self.name}")
-        port, namespace = f"port{self.place}", self.holder.pid
-        # Segmentation by the kernel: the ether sees the datagrams that a radio would.
-        run(f"ip link add {port} gso_max_segs 1 type veth peer name mesh0 gso_max_segs 1 netns {namespace}")
-        run(f"ip link set {port} up")
         self.ip("link set lo up")
-        self.ip("link set mesh0 addrgenmode none")
         # As systemd sets it: a second address stays when the first one goes.
         promote = "echo 1 > /proc/sys/net/ipv4/conf/all/promote_secondaries"
-        subprocess.run(["nsenter", "-t", str(namespace), "-n", "sh", "-c", promote], check=True)
-        self.plug_in()
-        self.ether.plug_in(self.name, port)
+        subprocess.run(["nsenter", "-t", str(self.holder.pid), "-n", "sh", "-c", promote], check=True)
+        for radio in self.radios:
+            radio.attach(self.holder.pid, self.ip)
 
     def _has_namespace(self) -> bool:
         """`unshare` has left this namespace, so that the interface can be moved."""
         return Path(f"/proc/{self.holder.pid}/ns/net").readlink() != Path("/proc/self/ns/net").readlink()
-
-    @property
-    def address(self) -> str:
-        return f"fe80::{self.host:x}/64" if self.ipv6 else f"10.7.{self.host >> 8}.{self.host & 255}/16"
 
     def configuration(self, folder: Path, stop_priority: int = 0, topics: str = TOPICS) -> str:
         return f"""
@@ -121,6 +110,7 @@ key_file = "{folder}/{self.name}.key"
 [topics]
 {topics.replace("priority = 0", f"priority = {stop_priority}")}
 {RATES}
+{self.more}
 [daemon]
 socket = "{folder}/{self.name}.sock"
 state_directory = "{folder}/{self.name}.disk"
@@ -129,12 +119,6 @@ state_directory = "{folder}/{self.name}.disk"
     def ip(self, words: str) -> None:
         """`ip WORDS` in its namespace."""
         run(f"nsenter -t {self.holder.pid} -n ip {words}")
-
-    def plug_in(self) -> None:
-        """The interface is up, with its address."""
-        self.ip("link set mesh0 up")
-        # The kernel removes an IPv6 address when the interface goes down.
-        self.ip(f"addr replace {self.address} {'nodad' if self.ipv6 else 'broadcast +'} dev mesh0")
 
     def start(self) -> None:
         if self.daemon.process is None:
@@ -167,43 +151,12 @@ state_directory = "{folder}/{self.name}.disk"
         elif self.daemon.process is not None:
             self.daemon.kill()
 
-    def move(self, host: int, *, overlaps: bool) -> None:
-        """Another address, as from another DHCP lease: instead of the old one, or before that goes."""
-        if overlaps:
-            self.plug_in()
-        else:
-            self.ip("addr flush dev mesh0")
-        old, self.host = self.address, host
-        self.plug_in()
-        if overlaps and old != self.address:
-            self.ip(f"addr del {old} dev mesh0")
-
-    def unplug(self, host: int) -> None:
-        """The interface goes down and loses its address; it will get another one."""
-        self.ip("link set mesh0 down")
-        self.ip("addr flush dev mesh0")
-        self.host = host
-
-    def refuse_to_send(self, how: str) -> None:
-        """The kernel refuses datagrams to single peers, with EACCES (`prohibit`), ENETUNREACH (`unreachable`) or EINVAL
-        (`blackhole`)."""
-        self.allow_to_send()
-        self.ip(f"{self._family} rule add pref {REFUSING_RULE} to {'fe80::/10' if self.ipv6 else '10.7.0.0/16'} {how}")
-
     def refuse_some(self, errors: str) -> None:
         """The kernel refuses some datagrams with these errors."""
         self._clock.with_suffix(".refused").write_text(errors)
 
     def refuse_none(self) -> None:
         self._clock.with_suffix(".refused").unlink(missing_ok=True)
-
-    def allow_to_send(self) -> None:
-        rules = f"nsenter -t {self.holder.pid} -n ip {self._family} rule del pref {REFUSING_RULE}"
-        subprocess.run(rules.split(), check=False, stderr=subprocess.DEVNULL)
-
-    @property
-    def _family(self) -> str:
-        return "-6" if self.ipv6 else "-4"
 
     def start_second(self) -> None:
         """Start the daemon once more while it runs. Raises Broken unless that is refused."""
@@ -239,7 +192,7 @@ state_directory = "{folder}/{self.name}.disk"
     def close(self) -> None:
         with contextlib.suppress(Broken):
             self.end(politely=True)
-        # The kernel would remove it some time after the namespace, when the next team may need the name.
-        subprocess.run(["ip", "link", "del", f"port{self.place}"], check=False, stderr=subprocess.DEVNULL)
+        for radio in self.radios:
+            radio.close()
         self.holder.kill()
         self.holder.wait()

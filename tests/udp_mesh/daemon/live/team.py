@@ -1,7 +1,8 @@
 """A team of real daemons on a hostile network, and what their programs were promised.
 
 It runs as root of a network and mount namespace of its own (`promises`). Each robot has a network namespace with one
-interface, whose other end is a port of `Ether`, and a small disk of its own.
+interface, or two, whose other end is a port of an `Ether`, and a small disk of its own. A robot with the legacy program
+may be among them.
 """
 
 from __future__ import annotations
@@ -15,8 +16,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 from tests.udp_mesh.daemon.live.ether import Ether
+from tests.udp_mesh.daemon.live.legacy import NAME as LEGACY
+from tests.udp_mesh.daemon.live.legacy import LegacyRobot
 from tests.udp_mesh.daemon.live.programs import Broken, Reader, Sent, Writer
-from tests.udp_mesh.daemon.live.robot import BEST_EFFORT, LOG_READERS, NEVER_EXPIRE, OUTBOXES, PASSED_ON_S, Robot, run
+from tests.udp_mesh.daemon.live.radio import run
+from tests.udp_mesh.daemon.live.robot import BEST_EFFORT, LOG_READERS, NEVER_EXPIRE, OUTBOXES, PASSED_ON_S, Robot
 from tests.udp_mesh.daemon.processes import KEY, OTHER_KEY
 from udp_mesh.client import MeshError
 
@@ -29,6 +33,10 @@ class LiveTeam:
         self.dice = random.Random(seed)
         self.size = size or self.dice.choice((2, 3, 3, 4, 4, 6))
         self.ipv6 = self.dice.random() < 0.25
+        radios = 2 if self.dice.random() < 0.4 else 1
+        self.ethers = [Ether(seed + number) for number in range(radios)]
+        """One for the first interface of each robot, and maybe one for its second."""
+        self.legacy: LegacyRobot | None = None
         self._version = version
         self.names = [chr(ord("a") + place) if place < 26 else f"r{place}" for place in range(self.size)]
         self.robots: dict[str, Robot] = {}
@@ -54,7 +62,6 @@ class LiveTeam:
         self._serial = 0
         self._later: list[tuple[float, Callable[[], None]]] = []
         self._stack = contextlib.ExitStack()
-        self.ether = Ether(seed)
 
     def __enter__(self) -> LiveTeam:
         with contextlib.ExitStack() as undo:
@@ -68,8 +75,11 @@ class LiveTeam:
         self.folder = folder
         run(f"mount -t tmpfs none {folder}")
         self._stack.callback(run, f"umount -l {folder}")
-        self.ether.start()
-        self._stack.callback(self.ether.close)
+        for ether in self.ethers:
+            ether.start()
+            self._stack.callback(ether.close)
+        if not self.ipv6 and self.dice.random() < 0.4:
+            self._add_legacy()
         other_version = self.dice.choice(self.names)
         for name in self.names:
             self._add(name, version=self._version if name == other_version else None)
@@ -77,9 +87,33 @@ class LiveTeam:
             self.open_reader(name)
             self.open_writer(name)
 
+    def _add_legacy(self) -> None:
+        # Its place is beyond those of robots that are added later.
+        self.legacy = LegacyRobot(60, self.ethers[0], self.folder)
+        self._stack.callback(self.legacy.close)
+        self.legacy.start()
+        self.received[LEGACY] = set()
+        self.ethers[0].unsealed.add(LEGACY)
+
+    @property
+    def everyone(self) -> list[str]:
+        """The robots, and the legacy one."""
+        return self.names if self.legacy is None else [*self.names, LEGACY]
+
     def _add(self, name: str, *, key: str = KEY, called: str = "", version: Path | None = None) -> Robot:
         place = len(self.robots) + len(self.others)
-        robot = Robot(self.folder, name, place, self.ether, ipv6=self.ipv6, key=key, called=called, version=version)
+        more = "" if self.legacy is None else self.legacy.neighbour
+        robot = Robot(
+            self.folder,
+            name,
+            place,
+            self.ethers,
+            ipv6=self.ipv6,
+            key=key,
+            called=called,
+            version=version,
+            more=more,
+        )
         self._stack.callback(robot.close)
         robot.attach()
         if self.dice.random() < 0.15:
@@ -142,6 +176,14 @@ class LiveTeam:
         sent = self.sent[key] = Sent(name, robot.runs, topic, key, to, size, time.monotonic())
         robot.writer.publish(sent)
 
+    def publish_legacy(self, topic: str, to: str | None, size: int) -> None:
+        """The legacy robot sends a message, of whose outcome it hears nothing."""
+        assert self.legacy is not None
+        self._serial += 1
+        key = f"{LEGACY} {self.legacy.runs} {self._serial}".encode()
+        sent = self.sent[key] = Sent(LEGACY, self.legacy.runs, topic, key, to, size, time.monotonic())
+        self.legacy.send(sent)
+
     # Time
 
     def later(self, after_s: float, action: Callable[[], None]) -> None:
@@ -162,8 +204,9 @@ class LiveTeam:
             time.sleep(0.01)
 
     def _poll(self) -> None:
-        if self.ether.failure is not None:
-            raise self.ether.failure
+        for ether in self.ethers:
+            if ether.failure is not None:
+                raise ether.failure
         now = time.monotonic()
         due = [action for at, action in self._later if at <= now]
         self._later = [(at, action) for at, action in self._later if at > now]
@@ -179,6 +222,11 @@ class LiveTeam:
             if robot.writer is not None:
                 for sent, header in robot.writer.poll():
                     self._on_outcome(sent, header)
+        for taken in self.legacy.poll() if self.legacy is not None else ():
+            known = self.sent.get(taken.key)
+            if known is None or (known.source, known.topic) != (taken.source, taken.topic):
+                raise Broken(f"the legacy robot received {taken}, which was {known}")
+            self.received[LEGACY].add(taken.key)
 
     def _on_message(self, name: str, robot: Robot, header: dict[str, object], key: bytes) -> None:
         sent = self.sent.get(key)
@@ -190,7 +238,7 @@ class LiveTeam:
         if self.copies[name][robot.runs, key] < 2:
             return
         again = sent.topic == "stored" and (sent.abandoned or self.robots[sent.source].runs != sent.run)
-        narrowed = (sent.source, name) in self.ether.too_long
+        narrowed = any((sent.source, name) in ether.too_long for ether in self.ethers)
         held = sent.to is None and sent.topic in OUTBOXES
         # What another robot of this name had not acknowledged was sent to this one again.
         troubled = name in self.disk_trouble or name in self.contested
@@ -207,6 +255,7 @@ class LiveTeam:
         if sent.to is not None and peer != sent.to:
             raise Broken(f"{sent} ended at {peer}: {header}")
         sent.ends[peer] = said
+        sent.ended_at = time.monotonic()
         if said in ("expired: refused", "expired: disk") or (
             outcome == "expired" and sent.topic in NEVER_EXPIRE and "not wanted" not in said
         ):
@@ -226,6 +275,7 @@ class LiveTeam:
             for sent in self.sent.values()
             if sent.accepted_at is not None
             and sent.to is not None
+            and not self._spans_legacy_runs(sent)
             and (
                 (not sent.abandoned and not sent.ends and sent.topic not in BEST_EFFORT)
                 or (self.is_durable(sent) and sent.key not in self.received[sent.to])
@@ -257,6 +307,24 @@ class LiveTeam:
             and sent.to not in self.contested
             and (sent.source not in self.disk_trouble or bool(sent.ends))
         )
+
+    def _spans_legacy_runs(self, sent: Sent) -> bool:
+        """Whether one run of the legacy program may have acknowledged a part of this message, and the next one the
+        rest."""
+        if self.legacy is None or sent.to not in (LEGACY, None) or sent.ends.get(LEGACY) != "delivered":
+            return False
+        assert sent.ended_at is not None
+        return any(sent.at <= at <= sent.ended_at for at in self.legacy.restarted_at)
+
+    def lost_at_legacy(self) -> list[Sent]:
+        """What was reported as delivered to the legacy robot but has not reached its programs."""
+        return [
+            sent
+            for sent in self.sent.values()
+            if sent.ends.get(LEGACY) == "delivered"
+            and sent.key not in self.received[LEGACY]
+            and not self._spans_legacy_runs(sent)
+        ]
 
     def not_passed_on(self) -> list[Sent]:
         """What was reported as delivered but has not reached a program that was subscribed there and stayed."""
