@@ -47,6 +47,14 @@ reload_config
 """
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Each worker that runs a test of the shared fleet starts one: the tests of a group have one worker."""
+    for item in items:
+        is_shared = "fleet" in getattr(item, "fixturenames", ()) and item.path.is_relative_to(Path(__file__).parent)
+        if is_shared and item.get_closest_marker("xdist_group") is None:
+            raise pytest.UsageError(f"{item.nodeid} uses the shared fleet: mark it with pytest.mark.xdist_group")
+
+
 def factory_reset(node: VirtualNode) -> None:
     """Erase what the node has on flash, and boot it. The fleet is shared: a radio that a test leaves behind would be
     taken for the next one's."""

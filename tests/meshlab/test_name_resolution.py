@@ -9,6 +9,8 @@ from meshlab.fleet import VirtualFleet, VirtualNode
 from tests.meshlab.conftest import factory_reset
 from tests.waiting import until
 
+pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("radios")]
+
 REMOVE = "uci delete dhcp.@dnsmasq[0]; uci commit dhcp"
 
 

@@ -15,6 +15,8 @@ from meshlab.fleet import VirtualFleet, VirtualNode
 from tests.meshlab.conftest import MESH, factory_reset
 from tests.waiting import until
 
+pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("radios")]
+
 WIRELESS = "etc/config/wireless"
 OPEN = """\
 set wireless.mesh0.mode=adhoc

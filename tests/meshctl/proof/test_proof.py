@@ -9,7 +9,7 @@ from tests.meshctl.proof.kills import Case
 from tests.meshctl.proof.matrix import apply_matrix, firmware, flash_matrix, kill_matrix
 from tests.meshctl.proof.rig import Rig
 
-pytestmark = [pytest.mark.proof, pytest.mark.lab, pytest.mark.xdist_group("fleet"), pytest.mark.timeout(6 * 3600)]
+pytestmark = [pytest.mark.proof, pytest.mark.lab, pytest.mark.xdist_group("rigs"), pytest.mark.timeout(6 * 3600)]
 
 
 def test_no_cut_at_any_step_of_an_apply_strands_a_node(tmp_path_factory: pytest.TempPathFactory) -> None:

@@ -61,7 +61,7 @@ def test_a_schedule_follows_from_its_seed() -> None:
 
 @pytest.mark.proof
 @pytest.mark.lab
-@pytest.mark.xdist_group("fleet")
+@pytest.mark.xdist_group("rigs")
 @pytest.mark.timeout(3600)
 @pytest.mark.parametrize("seed", SEEDS)
 def test_whatever_cuts_a_replacement_short_the_same_command_completes_it(seed: int, tmp_path: Path) -> None:

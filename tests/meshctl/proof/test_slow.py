@@ -12,7 +12,7 @@ from tests.meshctl.proof.rig import Rig
 pytestmark = [
     pytest.mark.proof,
     pytest.mark.lab,
-    pytest.mark.xdist_group("fleet"),
+    pytest.mark.xdist_group("rigs"),
     pytest.mark.timeout(1800),
 ]
 

@@ -15,7 +15,7 @@ from tests.meshctl.status.terminal import PATIENCE_S, Terminal
 from tests.processes import killed_on_failure
 from tests.waiting import until
 
-pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("fleet")]
+pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("rigs")]
 
 
 @pytest.fixture(scope="module")

@@ -1,5 +1,5 @@
 """One QEMU machine for the tests of this folder, provisioned from factory state to a working mesh once; the tests of
-`team` have their own, which is stopped before this one starts.
+`team` and `routed` have their own, each a group and thus a worker of its own.
 
 Tests that change the fleet leave it in the state of its inventory. scripts/setup-lab installs QEMU when it is missing:
 no test is skipped.
@@ -7,6 +7,7 @@ no test is skipped.
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import subprocess
@@ -327,5 +328,7 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
 
 
 def set_up_host() -> None:
-    """Install QEMU and the requirements of apt, unless they are installed."""
-    subprocess.run((SETUP,), check=True, timeout=START_S)
+    """Install QEMU and the requirements of apt, unless they are installed; two workers cannot do that at once."""
+    with Path(tempfile.gettempdir(), "meshctl-setup-lab.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        subprocess.run((SETUP,), check=True, timeout=START_S)

@@ -13,7 +13,7 @@ from tests.meshlab.qemu.conftest import Lab, until
 from tests.meshlab.qemu.routed.conftest import RoutedLab
 from tests.meshlab.qemu.test_telemetry import is_there, on_machine, put_programs
 
-pytestmark = [pytest.mark.proof, pytest.mark.lab, pytest.mark.xdist_group("lab-real"), pytest.mark.timeout(2400)]
+pytestmark = [pytest.mark.proof, pytest.mark.lab, pytest.mark.xdist_group("lab-real-routed"), pytest.mark.timeout(2400)]
 
 COMPUTERS = {"base-station": "10.43.0.10", "husky": "10.43.1.10", "spot": "10.42.0.30"}
 _DAEMON = """

@@ -10,7 +10,7 @@ from meshlab.qemu import control
 from tests.meshlab.qemu.conftest import until
 from tests.meshlab.qemu.team.conftest import FIELDED, KEYS, Team
 
-pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("lab-real"), pytest.mark.timeout(1800)]
+pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("lab-real-team"), pytest.mark.timeout(1800)]
 
 TWINS = ("b02", "husky")
 # data frames in ten seconds: the number of encrypted ones, and of unencrypted ones except handshakes

@@ -12,7 +12,7 @@ from tests.meshlab.qemu.conftest import until
 from tests.meshlab.qemu.team.conftest import FIELDED, Team
 from tests.meshlab.qemu.team.test_encrypted import TWINS, all_authorized, heard_over, keys
 
-pytestmark = [pytest.mark.proof, pytest.mark.lab, pytest.mark.xdist_group("lab-real"), pytest.mark.timeout(1800)]
+pytestmark = [pytest.mark.proof, pytest.mark.lab, pytest.mark.xdist_group("lab-real-team"), pytest.mark.timeout(1800)]
 
 
 def results(events: Iterable[dict[str, Any]]) -> dict[str, str]:

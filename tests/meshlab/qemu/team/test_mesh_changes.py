@@ -8,7 +8,7 @@ from tests.meshlab.qemu.conftest import TRIES, until
 from tests.meshlab.qemu.team.conftest import FIELDED, Team
 from tests.meshlab.qemu.team.test_encrypted import all_authorized, keys
 
-pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("lab-real"), pytest.mark.timeout(1800)]
+pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("lab-real-team"), pytest.mark.timeout(1800)]
 
 # tolerance between the ages of two nodes' entries of each other; far below the age of the mesh
 SLACK_S = 20

@@ -8,7 +8,7 @@ from meshctl.inventory import load_fleet
 from tests.meshlab.qemu.conftest import until
 from tests.meshlab.qemu.team.conftest import Team
 
-pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("lab-real"), pytest.mark.timeout(1800)]
+pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("lab-real-team"), pytest.mark.timeout(1800)]
 
 
 def test_a_factory_fresh_device_takes_over_a_dead_beacons_name_and_place(team: Team) -> None:
