@@ -28,6 +28,7 @@ from meshctl.cli.commands import COMMANDS, Entry
 from meshctl.cli.extensions import load
 from meshctl.cli.output import discard_output, echo, ignore_broken_pipe, outlive_reader, prepare_streams
 from meshctl.errors import ExitCode, InputError, MeshctlError
+from meshctl.start_up import raise_at_ctrl_c
 
 if TYPE_CHECKING:
     from meshctl.cli.user_config import Defaults
@@ -205,6 +206,7 @@ def _guarded(command: Callable[..., Any]) -> Callable[..., Any]:
 
     @functools.wraps(command)
     def run(*args: Any, **kwargs: Any) -> Any:
+        raise_at_ctrl_c()
         try:
             with outlive_reader() if kwargs.get("yes") else nullcontext():
                 return command(*args, **kwargs)
