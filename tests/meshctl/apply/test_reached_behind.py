@@ -15,12 +15,12 @@ from meshctl.device.observation import Observation, Station
 from meshctl.fleet import Interrupt
 from meshctl.plan.radios import NO_RADIOS
 from tests.meshctl.apply.mesh_nodes import MACS, node
-from tests.meshctl.apply.test_station_flush import Neighbours
+from tests.meshctl.apply.test_station_flush import Neighbors
 
 BEHIND = MACS["b03"]
 
 
-class Chain(Neighbours):
+class Chain(Neighbors):
     """b01 - b02 - b03, where b02 has rebooted and b03 drops what it sends until it has sent enough."""
 
     def __init__(self) -> None:
