@@ -178,7 +178,7 @@ def import_device(
         str,
         typer.Argument(
             metavar="[USER@]HOST[:PORT]",
-            help="Address of the device; in a lab also the name of a node that is plugged in.",
+            help="Address of the device; in a lab also the name of a plugged-in node.",
         ),
     ],
     fingerprint: Annotated[
