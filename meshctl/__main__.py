@@ -1,5 +1,15 @@
-"""`python -m meshctl` is `meshctl`."""
+"""The process `meshctl`, also as `python -m meshctl`."""
 
-from meshctl.cli.main import main
+from meshctl.start_up import end_at_ctrl_c
 
-main()
+
+def start() -> None:
+    """Run the command line."""
+    end_at_ctrl_c()
+    from meshctl.cli.main import main
+
+    main()
+
+
+if __name__ == "__main__":
+    start()

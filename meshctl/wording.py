@@ -36,6 +36,12 @@ def node_list(names: Sequence[str]) -> str:
     return ", ".join(names) if len(names) <= MAX_IN_FULL else f"{counted(len(names), 'node')} ({join_limited(names)})"
 
 
+def all_of(names: Sequence[str]) -> str:
+    """`b01, b02 and b03`."""
+    *others, last = names
+    return f"{', '.join(others)} and {last}" if others else last
+
+
 def one_of(names: Sequence[str]) -> str:
     """The alternatives after `expected`; the name alone if there is no other."""
     return names[0] if len(names) == 1 else f"one of {join_limited(names)}"

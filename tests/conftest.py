@@ -36,12 +36,8 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 # Eight thousand collected tests and their modules stay: the default thresholds search them again and again for cycles.
 gc.set_threshold(50_000, 20, 50)
 
-LONGEST_GROUPS = (
-    *("lab-real-team", "lab", "fleet", "nats", "lab-real", "tutorials"),
-    *("logins", "rigs", "sites", "stations", "radios"),
-)
-"""The groups of tests on virtual fleets or a machine, which wait for minutes, longest first: each begins as soon as a
-worker is free."""
+LONGEST_GROUPS = ("lab-real-team", "lab", "fleet", "nats")
+"""The groups of tests that share a fleet or a machine and wait for minutes: each begins at once, on its own worker."""
 GROUPS_UNTIL = 2 / 3
 """The share of the tests without a group before which all other groups have begun."""
 

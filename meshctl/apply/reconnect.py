@@ -15,7 +15,9 @@ from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass
 
+from meshctl.apply.context import RunContext
 from meshctl.apply.stale_stations import CAUGHT_UP, GONE, MAX_QUERIED, StationEntry, inventory_login, reconnect_script
+from meshctl.device.observation import Observation
 from meshctl.device.ssh import SshConnection
 from meshctl.errors import NodeError
 from meshctl.fleet import Event, EventKind, Interrupt, Observer, silent
@@ -96,6 +98,22 @@ def reconnect(
         return repaired(
             {name: answer.result() for name, answer in answers.items()}, asked, observed.unreachable, owners
         )
+
+
+def reach_behind(run_context: RunContext, node: str, now: Observation, names: Iterable[str]) -> frozenset[str]:
+    """Have a node that has rebooted repair its links to these neighbors, which drop its frames: those behind it are
+    reached by no other. Returns the nodes that may be reachable now."""
+    if run_context.interrupt.stopping:
+        return frozenset()
+    observed = FleetObservation({node: now}, dict.fromkeys(names, ""), {})
+    owners = run_context.current_mac_owners()
+    interrupt, observer = run_context.interrupt, run_context.observer
+    done = reconnect(
+        run_context.connections, run_context.fleet, observed, owners, interrupt=interrupt, observer=observer
+    )
+    for note in done.notes:
+        run_context.note(note)
+    return done.nodes
 
 
 def repaired(

@@ -4,7 +4,7 @@
     unreachable, also before the start: the other holders are queried, with growing pauses; after `BOOT_S` those of its
         other radios as well, which restart if it has lost its power; its SSH server has to answer, too: at once if the
         node watches its own entries or the change cannot drop logins, otherwise once its timer has undone the change
-    ended: all holders that do not watch, and the nodes it hears now, are queried
+    ended: all holders that do not watch, and the nodes it hears now, are queried, after a reboot from its side, too
     end of the run: those that did not answer are queried again, and the operator sees the rest (`retry_unanswered`)
     next run: the same for a change whose end was not observed, or a reboot (`flush_later`)
 
@@ -25,6 +25,7 @@ from functools import partial
 from typing import TypeAlias
 
 from meshctl.apply.context import NodeContext, RunContext
+from meshctl.apply.reconnect import reach_behind
 from meshctl.apply.stale_stations import (
     GONE,
     KEPT,
@@ -49,6 +50,7 @@ from meshctl.device.observation import Observation
 from meshctl.device.ssh import SshConnection
 from meshctl.errors import NodeError
 from meshctl.plan.radios import EVERY_RADIO, NO_RADIOS, Radios, observed_restarts, started_within
+from meshctl.wording import all_of
 
 # A neighbor waits up to 3 s for an echo, and 3 s for a login, once for each of a node's two radios.
 QUERY_TIMEOUT_S = 15.0
@@ -73,8 +75,7 @@ UNFLUSHED = "not_asked"
 MAY_LOSE = ": unicast frames to them may be lost for minutes"
 
 
-# Makes the script for a neighbor once it is connected: ages count up to then, and during a login of seconds a new entry
-# would seem older than the change.
+# Makes a script once its neighbor is connected: during a login of seconds a new entry would seem older than the change.
 Script: TypeAlias = Callable[[], str]
 
 
@@ -141,7 +142,7 @@ class StationFlush:
         unwatched = [name for name in names if name not in self._watching]
         if unwatched:
             run_context.note(
-                f"{_listed(unwatched)} did not answer and cannot watch their entries of its radio", self.node
+                f"{all_of(unwatched)} did not answer and cannot watch their entries of its radio", self.node
             )
 
     def watch_own_entries(self, connection: SshConnection, *, for_s: float) -> None:
@@ -234,6 +235,10 @@ class StationFlush:
         if unverified and now is not None:
             self._flush_seen(unverified, now, since_s)
         self._unanswered = {name: entries for name, entries in holders.items() if name not in answers}
+        if self._unanswered and rebooted and now is not None:
+            reached = reach_behind(self.ctx.run, self.node, now, self._unanswered)
+            answers = self._flush({name: self._unanswered[name] for name in reached & self._unanswered.keys()}, since_s)
+            self._unanswered = {name: held for name, held in self._unanswered.items() if name not in answers}
         if self._unanswered:
             self.unfinished.append(self)
 
@@ -293,7 +298,7 @@ class StationFlush:
             nodes = [name for name, answer in answers.items() if word in answer.split() and name not in self._reported]
             if nodes:
                 self._reported.update(nodes)
-                self.ctx.run.note(f"{_listed(nodes)} {text}", self.node)
+                self.ctx.run.note(f"{all_of(nodes)} {text}", self.node)
 
     def own_lines(self, answer: str) -> str:
         """The lines of an answer that concern this node's radios."""
@@ -351,7 +356,7 @@ class StationFlushes:
             if unanswered:
                 unflushed[flush.node] = unanswered
                 run_context.note(
-                    f"{_listed(unanswered)} did not answer and may hold a stale entry of its radio{MAY_LOSE}",
+                    f"{all_of(unanswered)} did not answer and may hold a stale entry of its radio{MAY_LOSE}",
                     flush.node,
                 )
         return unflushed
@@ -393,8 +398,3 @@ def _query_one(run_context: RunContext, name: str, script: Script) -> str | None
         patience.cancel()
         connections.release(name, connection)
     return done.stdout.strip()
-
-
-def _listed(names: Sequence[str]) -> str:
-    *others, last = names
-    return f"{', '.join(others)} and {last}" if others else last

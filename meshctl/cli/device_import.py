@@ -175,7 +175,11 @@ def _interface(text: str) -> IpInterface | None:
 def import_device(
     target: ImportTarget,
     device: Annotated[
-        str, typer.Argument(metavar="[USER@]HOST[:PORT]", help="Address of the device; in a lab also a node's name.")
+        str,
+        typer.Argument(
+            metavar="[USER@]HOST[:PORT]",
+            help="Address of the device; in a lab also the name of a plugged-in node.",
+        ),
     ],
     fingerprint: Annotated[
         str, typer.Option("--fingerprint", metavar="SHA256:...", help="Its host key's fingerprint, as printed on it.")

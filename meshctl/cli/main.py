@@ -15,6 +15,7 @@ import os
 import shlex
 import sys
 from collections.abc import Callable, MutableMapping, Sequence
+from contextlib import nullcontext
 from itertools import groupby
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -25,8 +26,9 @@ from meshctl import __version__
 from meshctl.cli.command_group import Command, CommandGroup
 from meshctl.cli.commands import COMMANDS, Entry
 from meshctl.cli.extensions import load
-from meshctl.cli.output import discard_output, echo, ignore_broken_pipe, prepare_streams
+from meshctl.cli.output import discard_output, echo, ignore_broken_pipe, outlive_reader, prepare_streams
 from meshctl.errors import ExitCode, InputError, MeshctlError
+from meshctl.start_up import raise_at_ctrl_c
 
 if TYPE_CHECKING:
     from meshctl.cli.user_config import Defaults
@@ -204,8 +206,10 @@ def _guarded(command: Callable[..., Any]) -> Callable[..., Any]:
 
     @functools.wraps(command)
     def run(*args: Any, **kwargs: Any) -> Any:
+        raise_at_ctrl_c()
         try:
-            return command(*args, **kwargs)
+            with outlive_reader() if kwargs.get("yes") else nullcontext():
+                return command(*args, **kwargs)
         except MeshctlError as error:
             _print_error(error)
             raise typer.Exit(int(error.exit_code)) from None

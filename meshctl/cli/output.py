@@ -25,13 +25,12 @@ if TYPE_CHECKING:
 
 def echo(text: object = "", *, err: bool = False, nl: bool = True, styled: bool = False) -> None:
     """Print text. `styled`: keep color escapes, which are meshctl's own."""
-    shown = clean_styled(str(text)) if styled else clean(str(text))
-    typer.echo(shown, err=err, nl=nl)
+    _write(clean_styled(str(text)) if styled else clean(str(text)), err=err, nl=nl)
 
 
 def echo_json(text: str, *, err: bool = False, nl: bool = True) -> None:
     """Print JSON text, escaped without changing its value."""
-    typer.echo(json_safe(text), err=err, nl=nl)
+    _write(json_safe(text), err=err, nl=nl)
 
 
 def echo_error(text: str) -> None:
@@ -41,7 +40,36 @@ def echo_error(text: str) -> None:
 
 def echo_bytes(raw: bytes, *, err: bool = False) -> None:
     """Print bytes unchanged."""
-    typer.echo(raw, err=err, nl=False)
+    _write(raw, err=err, nl=False)
+
+
+_needs_reader = True
+
+
+@contextmanager
+def outlive_reader() -> Iterator[None]:
+    """Within it, output whose reader is gone is discarded, and the command continues: it changes something, and asks no
+    question."""
+    global _needs_reader
+    _needs_reader = False
+    try:
+        yield
+    finally:
+        _needs_reader = True
+
+
+def _write(text: str | bytes, *, err: bool, nl: bool) -> None:
+    try:
+        typer.echo(text, err=err, nl=nl)
+    except BrokenPipeError:
+        lose_reader()
+
+
+def lose_reader() -> None:
+    """Called while a BrokenPipeError is handled: raises it again, or discards the output from now on."""
+    if _needs_reader:
+        raise
+    discard_output()
 
 
 def write_file(path: Path, content: str | bytes) -> None:
@@ -103,7 +131,12 @@ def console() -> Console:
     """Standard output for rich, without styles when NO_COLOR is set."""
     from rich.console import Console
 
-    return Console(color_system=None if is_plain() else "auto", highlight=False, markup=False)
+    class PipedConsole(Console):
+        def on_broken_pipe(self) -> None:
+            # rich would exit with 1
+            lose_reader()
+
+    return PipedConsole(color_system=None if is_plain() else "auto", highlight=False, markup=False)
 
 
 def prepare_streams() -> None:

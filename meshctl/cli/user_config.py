@@ -59,9 +59,9 @@ class Defaults:
         """The defaults of a command's options, and of those of its commands. Raises InputError with file and line."""
         common = {key: value for key, value in self.values.items() if key in _OPTIONS and not isinstance(value, dict)}
         table = self.values.get(name)
-        return self._of(command, table if isinstance(table, dict) else {}, common, (name,))
+        return self._section_defaults(command, table if isinstance(table, dict) else {}, common, (name,))
 
-    def _of(
+    def _section_defaults(
         self, command: Any, table: Mapping[str, Any], common: Mapping[str, Any], names: tuple[str, ...]
     ) -> dict[str, Any]:
         if hasattr(command, "commands"):
@@ -70,7 +70,7 @@ class Defaults:
                     hint = did_you_mean(key, command.commands)
                     raise self._error(names, key, f"`meshctl {' '.join(names)}` has no command {key!r}", hint)
             return {
-                word: self._of(inner, table.get(word, {}), common, (*names, word))
+                word: self._section_defaults(inner, table.get(word, {}), common, (*names, word))
                 for word, inner in command.commands.items()
             }
         options = {each.name: each for each in command.params if each.param_type_name == "option"}

@@ -106,7 +106,7 @@ def connect(
                     f"{endpoint.label}: login refused for {endpoint.user}; tried: {given}",
                     tried=tuple(tried),
                     allowed=allowed,
-                    hint="use a key whose public part is in the node's /etc/dropbear/authorized_keys",
+                    hint="name a key (--key, ssh.key_files) whose public part is in its /etc/dropbear/authorized_keys",
                 )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import functools
 import os
 import resource
@@ -26,7 +27,6 @@ from jinja2.utils import missing
 
 from meshctl.diagnostics import Diagnostic, InvalidInput, Position, Severity
 from meshctl.file_access import Boundary, located
-from meshctl.inventory.suggest import did_you_mean
 from meshctl.model import Backend, MeshMode, OperatorParts, Release
 from meshctl.render.quoting import quoted, require_quoted, revealed
 from meshctl.render.template_files import (
@@ -118,7 +118,8 @@ class _Missing(StrictUndefined):
         if self._undefined_hint or value is missing or isinstance(value, Mapping):
             return super()._undefined_message
         known = [known for known in dir(value) if not known.startswith("_")]
-        instead = did_you_mean(str(name), known) or f"it has {', '.join(known)}"
+        near = difflib.get_close_matches(str(name), known, 1)
+        instead = f"did you mean {near[0]!r}?" if near else f"it has {', '.join(known)}"
         return f"{type(value).__name__} has no {name!r}; {instead}"
 
 

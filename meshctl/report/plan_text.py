@@ -104,6 +104,12 @@ def _closing_summary(plan: Plan, nodes: Iterable[NodePlan]) -> Iterator[Line]:
         yield Line(f"  {verdict.value}: {text}", "yellow" if verdict is Verdict.AWAY else "red")
 
 
+def _without_name(node: NodePlan) -> str:
+    """The reason without the node: the error of a failed connection starts with it and its address."""
+    address, colon, rest = node.reason.removeprefix(f"{node.node} (").partition("): ")
+    return f"{address}: {rest}" if colon and node.reason.startswith(f"{node.node} (") else node.reason
+
+
 def _common_reason(node: NodePlan) -> str:
     """The reason without what differs between nodes: their names and addresses, and where they were last seen."""
     reason = node.reason.removeprefix(node.node).lstrip(" ")
@@ -176,9 +182,7 @@ def _node(group: tuple[NodePlan, ...], *, with_diffs: bool) -> Iterator[Line]:
             yield Line("")
             who = node.node if len(group) == 1 else f"{len(group)} nodes"
             style = "yellow" if node.verdict is Verdict.AWAY else "red"
-            # the error of a failed connection starts with the node
-            reason = node.reason.removeprefix(f"{node.node} ") if len(group) == 1 else node.reason
-            yield Line(f"{who}  {node.verdict.value}: {reason}", style)
+            yield Line(f"{who}  {node.verdict.value}: {_without_name(node) if len(group) == 1 else node.reason}", style)
             if len(group) > 1:
                 yield Line(f"  {', '.join(member.node for member in group)}")
             if node.hint:

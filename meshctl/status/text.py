@@ -129,13 +129,13 @@ def _alarm_lines(status: FleetStatus, width: int | None, paint: Paint, brief: bo
 
 def _wrapped(lead: str, text: str, width: int | None, paint: Paint, style: str) -> Iterator[str]:
     """`lead` in its style, then the text, wrapped."""
-    first, *others = _beside(f"{lead} ", text, width, "   " if text.startswith("-> ") else "")
+    first, *others = _wrap_after(f"{lead} ", text, width, "   " if text.startswith("-> ") else "")
     yield f"{paint(lead, style)}{first[len(lead) :]}"
     yield from others
 
 
-def _beside(lead: str, text: str, width: int | None, indent: str = "") -> list[str]:
-    """The text wrapped beside `lead`, with later lines `indent`ed further; below it where there is no room beside."""
+def _wrap_after(lead: str, text: str, width: int | None, indent: str = "") -> list[str]:
+    """The text wrapped after `lead`, with later lines `indent`ed further; below it if there is no room."""
     lead, text = one_line(lead), one_line(text)
     if width is None:
         return [f"{lead}{text}"]
@@ -169,7 +169,7 @@ def topic_lines(status: FleetStatus, width: int | None = None) -> list[str]:
     lines = []
     for *cells, problem in rows:
         lead = "".join(cell.ljust(room) for cell, room in zip(cells, widths, strict=True) if room)
-        lines += [line.rstrip() for line in _beside(lead, problem, width)]
+        lines += [line.rstrip() for line in _wrap_after(lead, problem, width)]
     return lines
 
 
@@ -184,7 +184,7 @@ def preflight_text(checks: Iterable[Check], width: int | None = None, paint: Pai
     lines = []
     for check in listed:
         word, style = _mark(check)
-        first, *others = _beside(f"{word}  {check.name.ljust(room)}  ", check.reason, width)
+        first, *others = _wrap_after(f"{word}  {check.name.ljust(room)}  ", check.reason, width)
         lines += [f"{paint(word, style)}{first[len(word) :]}", *others]
     failed = [check.name for check in listed if not check.is_go]
     if failed:

@@ -68,7 +68,7 @@ def _ip(shown: object) -> str:
 
 def merge(text: str, hosts: Iterable[HostEntry]) -> MergedHosts:
     """The hosts file `text` with these hosts as its block, in place of an earlier block or at the end."""
-    before, after = _around_block(text)
+    before, after = _split_around_block(text)
     defined = _names(before) | _names(after)
     entries: list[HostEntry] = []
     conflicts: list[HostEntry] = []
@@ -85,10 +85,10 @@ def merge(text: str, hosts: Iterable[HostEntry]) -> MergedHosts:
 
 def without_block(text: str) -> str:
     """The hosts file without the block."""
-    return "".join(_around_block(text))
+    return "".join(_split_around_block(text))
 
 
-def _around_block(text: str) -> tuple[str, str]:
+def _split_around_block(text: str) -> tuple[str, str]:
     """The text before and after the block; ("...", "") without one.
 
     A block that lost its last line ends at the first line that is not one of its entries.

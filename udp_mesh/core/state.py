@@ -28,7 +28,7 @@ from udp_mesh.core.settings import RELAY_LINK, LinkInfo, LinkKind, Neighbour, Se
 from udp_mesh.core.subscriptions.selection import Selection
 from udp_mesh.core.thin.copies import MessageCopies
 from udp_mesh.core.versions.sent import SentVersions
-from udp_mesh.crypto import Key, Keyring, SendChannel
+from udp_mesh.crypto import Key, SendChannel
 
 _NEVER = float("inf")
 
@@ -41,7 +41,7 @@ SUSPENDED_S = 1.0
 
 def live_keys(settings: Settings) -> tuple[Key, ...]:
     """The keys of the settings, or the public key of unkeyed mode."""
-    return settings.keys or Keyring.unkeyed().keys
+    return settings.keys or (Key.unkeyed(),)
 
 
 class State:

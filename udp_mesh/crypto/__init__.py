@@ -16,7 +16,7 @@ from udp_mesh.crypto.channel import (
     age_together,
     check_long,
 )
-from udp_mesh.crypto.keys import Key, Keyring, UnknownKeyError
+from udp_mesh.crypto.keys import Key, UnknownKeyError
 from udp_mesh.crypto.replay import ReplayWindow
 
 __all__ = [
@@ -24,7 +24,6 @@ __all__ = [
     "SHORT_OVERHEAD_BYTES",
     "TO_ALL",
     "Key",
-    "Keyring",
     "OpenError",
     "ReceiveChannel",
     "ReplayError",

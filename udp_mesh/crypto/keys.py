@@ -1,6 +1,6 @@
 """The fleet's keys: 32 secret bytes each, one or two live at a time. The first one seals, all of them open.
 
-Rotation without interruption: every node gets (old, new), then (new, old), then (new,). `Keyring.unkeyed()` uses a
+Rotation without interruption: every node gets (old, new), then (new, old), then (new,). `Key.unkeyed()` is a
 public key: the same format and code without protection. Such nodes cannot communicate with nodes that have a real key,
 and report that.
 """
@@ -18,8 +18,6 @@ from udp_mesh.wire.header import CHECK_BYTES
 
 SECRET_BYTES = 32
 KEY_ID_BYTES = 4
-MAX_LIVE_KEYS = 2
-"""More would multiply the work that a forged datagram causes; rotation needs two."""
 
 _EXTRACT_SALT = b"udp_mesh wire 1 fleet key"
 _UNKEYED_SECRET = hashlib.sha256(b"udp_mesh: no key, no protection").digest()
@@ -61,6 +59,11 @@ class Key:
                 f"found {len(compact)} characters"
             ) from error
 
+    @classmethod
+    def unkeyed(cls) -> Key:
+        """The public key of nodes without a key: for testing only."""
+        return cls(_UNKEYED_SECRET)
+
     def check(self, header: bytes | memoryview) -> bytes:
         """The 4-byte keyed hash at the end of a long header (RFC 7693): cheap, and enough to drop invented senders."""
         return hashlib.blake2s(header, key=self.check_key, digest_size=CHECK_BYTES).digest()
@@ -72,30 +75,3 @@ class UnknownKeyError(DecodeError):
     def __init__(self, key_id: bytes) -> None:
         super().__init__(f"sealed with unknown key {key_id.hex()}")
         self.key_id = key_id
-
-
-@dataclass(frozen=True, slots=True)
-class Keyring:
-    """The live keys, the sealing one first."""
-
-    keys: tuple[Key, ...]
-
-    def __post_init__(self) -> None:
-        if not 1 <= len(self.keys) <= MAX_LIVE_KEYS:
-            raise ValueError(f"expected 1 to {MAX_LIVE_KEYS} live keys, found {len(self.keys)}")
-
-    @classmethod
-    def unkeyed(cls) -> Keyring:
-        """The public key: for testing only."""
-        return cls((Key(_UNKEYED_SECRET),))
-
-    @property
-    def sealing(self) -> Key:
-        return self.keys[0]
-
-    def find(self, key_id: bytes) -> Key:
-        """The live key with this id. Raises `UnknownKeyError`."""
-        for key in self.keys:
-            if key.key_id == key_id:
-                return key
-        raise UnknownKeyError(key_id)

@@ -47,7 +47,7 @@ class ThinLinkDocument(Document):
     """Share of each hour in which a robot may send. Default: that of the band."""
 
     @model_validator(mode="after")
-    def _of_the_framing(self) -> Self:
+    def _check_framing(self) -> Self:
         meshtastic = self.framing is ThinFraming.MESHTASTIC
         if meshtastic and self.model_fields_set & {"bits_per_s", "frame_s", "baud"}:
             raise expected_error("no bits_per_s, frame_s and baud with framing: meshtastic: the preset gives them")

@@ -1,16 +1,20 @@
-"""Files that options such as `--out` name."""
+"""Output: files that options such as `--out` name, and a reader that is gone."""
 
 from __future__ import annotations
 
 import os
 import resource
+import subprocess
+import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import typer
 
-from meshctl.cli.output import write_file
+from meshctl.cli.main import _guarded
+from meshctl.cli.output import echo, write_file
 from meshctl.errors import InputError
 
 
@@ -54,3 +58,47 @@ def test_a_pipe_is_written_to_and_not_replaced(tmp_path: Path) -> None:
     reader.join()
     assert heard == ["for another program"]
     assert pipe.is_fifo()
+
+
+@pytest.mark.parametrize("written", ["echo('line')", "echo_json('{}')", "echo_bytes(b'x')", "console().print('line')"])
+@pytest.mark.parametrize("yes", [True, False])
+def test_only_a_command_that_changes_something_outlives_its_reader(written: str, yes: bool) -> None:
+    """`provision --yes | head` made no run and said nothing: rich ended the process with 1."""
+    program = f"""
+import sys
+from contextlib import nullcontext
+from meshctl.cli.output import console, echo, echo_bytes, echo_json, outlive_reader
+with outlive_reader() if {yes} else nullcontext():
+    {written}
+    sys.stdout.flush()
+    {written}
+    sys.stderr.write("the run")
+"""
+    reader, writer = os.pipe()
+    os.close(reader)
+    done = subprocess.run(
+        [sys.executable, "-c", program], stdout=writer, stderr=subprocess.PIPE, text=True, check=False
+    )
+    os.close(writer)
+    assert ("the run" in done.stderr) == yes
+    assert ("BrokenPipeError" in done.stderr) == (not yes)
+
+
+def test_an_option_yes_makes_a_command_outlive_its_reader(monkeypatch: pytest.MonkeyPatch) -> None:
+    calls: list[object] = []
+
+    def command(*, yes: bool) -> None:
+        echo("plan")
+        calls.append(yes)
+
+    def broken(*_args: object, **_options: object) -> None:
+        raise BrokenPipeError
+
+    monkeypatch.setattr("typer.echo", broken)
+    monkeypatch.setattr("meshctl.cli.output.discard_output", lambda: None)
+    guarded = _guarded(command)
+    guarded(yes=True)
+    assert calls == [True]
+    with pytest.raises(typer.Exit):
+        guarded(yes=False)
+    assert calls == [True]

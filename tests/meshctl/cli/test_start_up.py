@@ -25,6 +25,7 @@ ENTRANCE = frozenset(
         "meshctl.errors",
         "meshctl.report",
         "meshctl.report.terminal_escapes",
+        "meshctl.start_up",
     }
 )
 # typer and what it imports, one of them only on some of its versions
@@ -66,3 +67,37 @@ def test_lint_of_shipped_templates_imports_no_ssh_no_cryptography_and_no_jinja(t
     assert packages(imported).isdisjoint(heavy)
     assert not imported & {"asyncio", "sqlite3", "ssl", "xml"}
     assert not imported & {"meshctl.render.compare", "meshctl.report.findings.junit", "meshctl.report.findings.sarif"}
+
+
+# Ctrl-C at this import: in the middle of the program's own, or of those of the command
+_INTERRUPTED_AT = """
+import builtins, os, signal, sys
+real = builtins.__import__
+def interrupted(name, *rest, **options):
+    if name == {module!r}:
+        os.kill(os.getpid(), signal.SIGINT)
+    return real(name, *rest, **options)
+signal.signal(signal.SIGINT, {handler})
+from meshctl.__main__ import start
+builtins.__import__ = interrupted
+sys.argv[1:] = ["inventory", "list", "-i", {inventory!r}]
+start()
+"""
+
+
+@pytest.mark.parametrize("module", ["typer", "meshctl.inventory"])
+def test_ctrl_c_during_the_start_is_no_traceback(module: str) -> None:
+    done = _start(module, "signal.default_int_handler")
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "interrupted\n")
+
+
+def test_a_start_that_ignores_ctrl_c_continues() -> None:
+    done = _start("typer", "signal.SIG_IGN")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "rover1-radio" in done.stdout
+
+
+def _start(module: str, handler: str) -> subprocess.CompletedProcess[str]:
+    inventory = str(ROOT / "inventory/starter")
+    program = _INTERRUPTED_AT.format(module=module, handler=handler, inventory=inventory)
+    return subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)

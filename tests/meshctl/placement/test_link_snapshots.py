@@ -108,18 +108,18 @@ def test_what_is_in_the_rack_is_no_relay() -> None:
         b01=table(9.0, "base", spot1=-30, base=-87),
         b02=table(9.0, "b01", spot1=-81, b01=-80),
     )
-    look = assemble(replace(seen, aboard=frozenset({"b01"})), HopMargins(7.0), 10.0, fresh=True)
-    assert {link.relay for link in look.links} == {"base", "b02"}
+    snapshot = assemble(replace(seen, aboard=frozenset({"b01"})), HopMargins(7.0), 10.0, fresh=True)
+    assert {link.relay for link in snapshot.links} == {"base", "b02"}
     # b02 reaches the base through the rack alone
-    assert set(look.paths) == {"base"}
-    assert look.next_hop == ""
+    assert set(snapshot.paths) == {"base"}
+    assert snapshot.next_hop == ""
 
 
 def test_a_beacon_leaves_the_rack_when_it_is_marked_or_heard_weakly() -> None:
     rack = Rack()
     assert rack.aboard({}, {"b01", "b02", "b03"}) == frozenset()
     assert rack.aboard({"b01": -30, "b02": -35, "b03": -75, "base": -40}, {"b01", "b02", "b03"}) == {"b01", "b02"}
-    # fading, and one look without it
+    # fading, and one snapshot without it
     assert rack.aboard({"b01": -44, "b02": -31}, {"b01", "b02", "b03"}) == {"b01", "b02"}
     assert rack.aboard({"b02": -45}, {"b01", "b02", "b03"}) == {"b01", "b02"}
     # dropped: b01 is behind the robot, b02 is marked beside it

@@ -226,6 +226,8 @@ def play(seed: int, seconds: float, *, hostile: bool = False) -> RandomTeam:
         if isinstance(team, HostileTeam):
             # What comes again so late is not taken.
             go(team, max(0.0, team.replays_until - team.now))
+        # Once a minute nodes tell each other what they hold of a log: that may be under way at this very moment.
+        go(team, 1.0, until=lambda: not team.queued_bytes())
         check_finished(team)
         return team
 

@@ -5,7 +5,9 @@ import random
 
 from tests.udp_mesh.core.legacy_program import LegacyProgram
 from tests.udp_mesh.core.test_legacy import OldRobot, fragments
-from udp_mesh.wire.legacy import LegacyAck, LegacyPayload
+from udp_mesh.core.events import Event, MessagePeerLost, PeerOffline
+from udp_mesh.core.settings import Rates
+from udp_mesh.wire.legacy import LegacyAck, LegacyPayload, decode_mesh_data
 
 DELAY_S, LOSS, TICK_S = 0.010, 0.2, 0.001
 
@@ -89,3 +91,39 @@ def test_after_a_loss_acknowledgements_are_repeated_once_more_for_ten_seconds() 
     assert acknowledgements(fragments(6, b"x")[0]) == 3
     old.now += 3.0
     assert acknowledgements(fragments(7, b"x")[0]) == 2
+
+
+def test_what_waits_for_a_legacy_robot_that_is_lost_ends() -> None:
+    old = OldRobot(rates=Rates(offline_s=3.0, peer_lost_s=6.0))
+    old.node.send("map", b"x", destination="old", now=old.now)
+    found: list[Event] = []
+    for _ in range(80):
+        old.hear()
+        found += old.events()
+        old.now += 0.1
+    assert [type(event) for event in found] == [PeerOffline, MessagePeerLost]
+
+
+def test_the_next_timer_is_that_of_the_fragment_that_waits_longest() -> None:
+    old = OldRobot()
+    sent: list[int] = []
+    for _ in range(2):
+        old.node.send("map", b"x", destination="old", now=old.now)
+        sent += {fragment.sequence for fragment in old.hear_payloads()}
+        old.now += 0.1
+    at = old.node.next_timer()
+    assert at is not None
+    old.now = at
+    assert {fragment.sequence for fragment in old.hear_payloads()} == {sent[0]}
+
+
+def test_messages_to_a_legacy_robot_are_numbered_in_their_header() -> None:
+    old = OldRobot()
+    numbers = []
+    for _ in range(3):
+        old.node.send("map", b"x", destination="old", now=old.now)
+        (fragment,) = old.hear_messages()
+        old.say(LegacyAck(fragment.sequence, 0))
+        old.say(LegacyAck(fragment.sequence, 1))
+        numbers.append(decode_mesh_data(fragment.data).sequence)
+    assert numbers == [1, 2, 3]

@@ -8,12 +8,10 @@ from udp_mesh.crypto import (
     LONG_OVERHEAD_BYTES,
     SHORT_OVERHEAD_BYTES,
     Key,
-    Keyring,
     OpenError,
     ReceiveChannel,
     ReplayError,
     SendChannel,
-    UnknownKeyError,
     age_together,
     check_long,
 )
@@ -133,19 +131,6 @@ def test_packet_numbers_beyond_32_bits_are_accepted() -> None:
         header = parse_header(data)
         assert isinstance(header, ShortHeader)
         assert receiver.open(data, header.number_low)[0] == number
-
-
-def test_a_keyring_finds_live_keys_and_reports_an_unknown_one() -> None:
-    old, new, foreign = KEY, Key(bytes(32)), Key(b"f" * 32)
-    ring = Keyring((new, old))
-    assert ring.sealing is new
-    assert ring.find(old.key_id) is old
-    with pytest.raises(UnknownKeyError, match=foreign.key_id.hex()):
-        ring.find(foreign.key_id)
-    with pytest.raises(ValueError, match="1 to 2"):
-        Keyring(())
-    with pytest.raises(ValueError, match="1 to 2"):
-        Keyring((old, new, foreign))
 
 
 def test_a_key_is_read_from_hexadecimal_and_base64_and_never_shown() -> None:

@@ -127,7 +127,9 @@ class LegacyAcks:
         self._restored_step = 0
         self._predicted_at = float("-inf")
         # Less urgent messages have lower numbers than the latest one: look behind each that was seen.
-        following = {_before(sequence, -ahead) for sequence in self._incomplete for ahead in range(1, WINDOW + 1)}
+        following = {
+            _sequence_behind(sequence, -ahead) for sequence in self._incomplete for ahead in range(1, WINDOW + 1)
+        }
         return [ack for sequence in following - self._incomplete.keys() for ack in _first(sequence)]
 
     def position(self) -> ReceivePosition | None:
@@ -147,7 +149,7 @@ class LegacyAcks:
             return []
         self._latest = sequence
         # If either side has just started, anything before may be in flight.
-        numbers = [_before(sequence, behind) for behind in range(1, min(ahead - 1, MAX_BEHIND) + 1)]
+        numbers = [_sequence_behind(sequence, behind) for behind in range(1, min(ahead - 1, MAX_BEHIND) + 1)]
         return [number for number in numbers if number not in self._incomplete]
 
     def due(self, now: float) -> list[LegacyAck]:
@@ -186,7 +188,7 @@ class LegacyAcks:
             first = expected + skip
             acks += [LegacyAck(sequence, position) for position in range(first, min(total, first + reach))]
         for ahead in range(1, reach + 1):
-            acks += _first(_before(self._latest, -skip - ahead))[: reach + 1 - ahead]
+            acks += _first(_sequence_behind(self._latest, -skip - ahead))[: reach + 1 - ahead]
         return acks
 
     def _repeat(self, ack: LegacyAck, now: float) -> None:
@@ -201,7 +203,7 @@ class LegacyAcks:
         self._repeats.insert(place, (at, ack, again))
 
 
-def _before(sequence: int, behind: int) -> int:
+def _sequence_behind(sequence: int, behind: int) -> int:
     """The message number `behind` places before this one; they run from 1 to `LAST_SEQUENCE`."""
     return (sequence - 1 - behind) % LAST_SEQUENCE + 1
 

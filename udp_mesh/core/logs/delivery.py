@@ -65,9 +65,9 @@ class Deliveries:
         item = self._receipts.pop(receipt.message_id, None)
         if item is not None:
             self._pending.discard(item)
-            self.again(item)
+            self.enqueue(item)
 
-    def again(self, item: ItemId) -> None:
+    def enqueue(self, item: ItemId) -> None:
         """Deliver an item on disk, at one of the next calls of `run`, unless a program may be reading it."""
         if item not in self._pending:
             self._pending.add(item)

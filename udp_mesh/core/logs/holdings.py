@@ -72,7 +72,7 @@ class Holdings:
         added = [name for name in topics if name not in before]
         self._restorer.restore(added, self.log, self.shelves)
         for item in (item for name in added for item, held in self.shelves[name].items.items() if held.waits):
-            self._deliveries.again(item)
+            self._deliveries.enqueue(item)
         read, was_read = {name for name in topics if self._policy.is_reader(name)}, self._read_topics
         self._read_topics = read
         for state in self.logs.values():
@@ -89,7 +89,7 @@ class Holdings:
             carried = [item for item, entry in held.items() if item.log == state.key and entry.use is ItemUse.CARRIED]
             for item in carried:
                 held[item].use = ItemUse.WAITING
-                self._deliveries.again(item)
+                self._deliveries.enqueue(item)
             self._store.mark(carried, ItemUse.WAITING)
             self._store.drop((), (self._remembered(state),))
         if state.add_reader(self._policy.name, tuple(state.received.ranges())):

@@ -8,8 +8,16 @@ from tests.udp_mesh.core.versions.receiving import TOPIC, receive, receiver
 from tests.udp_mesh.wire.make_vectors import FOLDER, REFUSED_VERSIONS, VERSIONS
 from udp_mesh.core.versions.encoding import Version, encode
 from udp_mesh.core.versions.received import ReceivedVersions
+from udp_mesh.wire.errors import DecodeError
 from udp_mesh.wire.frames import MessageFlag, RefuseReason
-from udp_mesh.wire.version import VERSION_HEADER_BYTES, version_hash
+from udp_mesh.wire.version import (
+    NO_BASE,
+    VERSION_HEADER_BYTES,
+    VersionHeader,
+    decode_version,
+    encode_version,
+    version_hash,
+)
 
 PUBLISHED = json.loads((FOLDER / "versions.json").read_text())
 
@@ -47,3 +55,11 @@ def test_what_is_sent_has_the_header_and_flags_of_the_published_version(name: st
     same = VERSION_HEADER_BYTES if flags & MessageFlag.COMPRESSED else len(body)
     assert sent.body[:same] == body[:same]
     assert receive(holding(None if base is None else base.hex()), sent.body, sent.flags) == payload
+
+
+def test_a_header_alone_is_an_empty_version() -> None:
+    body = encode_version(VersionHeader(NO_BASE, version_hash(b"")), b"")
+    header, content = decode_version(body)
+    assert (header.digest, bytes(content)) == (version_hash(b""), b"")
+    with pytest.raises(DecodeError, match="found 11"):
+        decode_version(body[:-1])
