@@ -91,7 +91,7 @@ def test_ctrl_c_during_the_start_is_no_traceback(module: str) -> None:
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "interrupted\n")
 
 
-def test_a_start_that_ignores_ctrl_c_goes_on() -> None:
+def test_a_start_that_ignores_ctrl_c_continues() -> None:
     done = _start("typer", "signal.SIG_IGN")
     assert (done.returncode, done.stderr) == (0, "")
     assert "rover1-radio" in done.stdout
