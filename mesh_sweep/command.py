@@ -98,7 +98,10 @@ def sweep(study: Study, options: SweepOptions, short: dict[str, str]) -> int:
             _note(f"interrupted: {have} of {len(cases)} cases are in {out}; run the same command to continue")
             return 130
         progress.end()
-        file.finish(results.values())
+        try:
+            file.finish(results.values())
+        except OSError as error:
+            _note(f"warning: {out} is not sorted: {error.strerror}; all results are there")
     return _show(study.identity, [results[case] for case in cases], options, study.figures)
 
 

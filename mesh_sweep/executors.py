@@ -6,6 +6,7 @@ A `Workers` opens executors; `run` opens another one after a pool broke. Dask is
 from __future__ import annotations
 
 import importlib
+import json
 import logging
 import multiprocessing
 import os
@@ -13,15 +14,17 @@ import re
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable
 from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Protocol
 
-from mesh_sweep.errors import SweepError
+from mesh_sweep.errors import CONTINUE, SweepError
 
-CONTINUE = "the results so far are kept, and the same command continues"
 _CONNECT_S = 15
+_FILE_POLL_S, _FILE_POLLS = 0.2, 150
 _ADDRESS = re.compile(r"([a-z]+://)?[^/]+:[0-9]+")
 
 
@@ -93,10 +96,14 @@ def _end_with(parent: Any) -> None:
 
 @dataclass(slots=True)
 class DaskWorkers:
-    """The workers of a Dask scheduler, which moves the cases of a dead worker to others by itself."""
+    """The workers of a Dask scheduler, which moves the cases of a dead worker to others by itself.
+
+    `address` is the scheduler's, or the file where it writes it (`dask scheduler --scheduler-file`).
+    """
 
     address: str
     _client: Any = field(default=None)
+    _is_waiting: bool = False
 
     def open(self) -> Executor:
         try:
@@ -105,9 +112,21 @@ class DaskWorkers:
             raise SweepError(
                 "--dask: expected the package distributed, found none: pip install 'meshctl-fleet[dask]'"
             ) from None
+        if self.address.endswith(".json"):
+            self.address = _address_in(Path(self.address))
         if not _ADDRESS.fullmatch(self.address):
             # distributed finds that out too late, and prints a traceback
-            raise SweepError(f"--dask: expected an address such as tcp://host:8786, found {self.address!r}")
+            raise SweepError(
+                "--dask: expected an address such as tcp://host:8786, or the JSON file of `dask scheduler "
+                f"--scheduler-file`, found {self.address!r}"
+            )
+        configured: Any = distributed.Security
+        if self.address.startswith("tls:") and configured().get_connection_args("client")["ssl_context"] is None:
+            # distributed prints a traceback, and waits for half a minute
+            raise SweepError(
+                f"--dask {self.address}: expected certificates for TLS in Dask's configuration "
+                "(distributed.comm.tls), found none"
+            )
         try:
             connect: Any = distributed.Client
             self._client = connect(self.address, timeout=_CONNECT_S, set_as_default=False)
@@ -115,19 +134,22 @@ class DaskWorkers:
             raise SweepError(
                 f"--dask: expected a Dask scheduler at {self.address}, found none: {str(error).splitlines()[0]}"
             ) from None
-        # lost connections are reported by the sweep, without a traceback
-        logging.getLogger("distributed").setLevel(logging.CRITICAL)
-        if not self._client.nthreads():
-            sys.stderr.write(f"{self.address} has no workers yet: waiting for the first one\n")
+        # lost connections are reported by the sweep, without a traceback; the client's logger has a level of its own
+        for name in ("distributed", "distributed.client"):
+            logging.getLogger(name).setLevel(logging.CRITICAL)
         executor: Executor = self._client.get_executor(pure=False)
         return executor
 
     def width(self) -> int:
         # workers may come and go; two each, and a few for those that join
         try:
-            return 2 * max(2, sum(int(count) for count in self._client.nthreads().values()))
+            threads = sum(int(count) for count in self._client.nthreads().values())
         except (OSError, RuntimeError, ValueError) as error:
             raise SweepError(f"lost the Dask scheduler at {self.address}: {error}; {CONTINUE}") from error
+        if not threads and not self._is_waiting:
+            sys.stderr.write(f"{self.address} has no workers: waiting for one\n")
+        self._is_waiting = not threads
+        return 2 * max(2, threads)
 
     def is_death(self, error: BaseException) -> bool:
         from distributed import KilledWorker
@@ -138,6 +160,18 @@ class DaskWorkers:
         # without waiting it cancels what it has, and knows no other option
         executor.shutdown(wait=not now)
         self._client.close()
+
+
+def _address_in(file: Path) -> str:
+    """The scheduler's address; one that was started just before, in the same job, has some seconds to write it."""
+    problem: Exception | None = None
+    for _ in range(_FILE_POLLS):
+        try:
+            return str(json.loads(file.read_bytes())["address"])
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            problem = error
+        time.sleep(_FILE_POLL_S)
+    raise SweepError(f"--dask {file}: expected the file of a Dask scheduler, found none: {problem}")
 
 
 @dataclass(slots=True)

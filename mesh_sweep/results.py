@@ -110,7 +110,10 @@ def _decode_line(line: bytes, where: str) -> tuple[Identity, Result]:
         figures = {str(name): _number(figure) for name, figure in value.get("figures", {}).items()}
         result = Result(Case(settings, int(value["seed"])), figures, str(value.get("failed", "")))
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
-        raise SweepError(f"{where}: expected a result of a sweep (one JSON object), found {_start(line)}") from None
+        raise SweepError(
+            f"{where}: expected a result of a sweep (one JSON object), found {_start(line)}; if the file is damaged, "
+            "remove this line, and its case runs again"
+        ) from None
     return identity, result
 
 

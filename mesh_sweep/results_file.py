@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import contextlib
 import fcntl
 import os
 import stat
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from mesh_sweep.errors import SweepError
+from mesh_sweep.errors import CONTINUE, SweepError
 from mesh_sweep.results import Identity, Result, StoredResults, decode, encode, encode_all
 
 
@@ -62,34 +61,30 @@ class ResultsFile:
             os.close(descriptor)
 
     def append(self, result: Result) -> None:
-        """Store one result now, with a single write. Raises OSError with the file's name."""
+        """Store one result now, with a single write. Raises SweepError for a full disk."""
         line = encode(self.identity, result)
-        with self._named_errors():
+        try:
             while line:
                 line = line[os.write(self._descriptor, line) :]
+        except OSError as error:
+            raise SweepError(f"{self.path}: {error.strerror}; {CONTINUE}") from error
 
     def finish(self, results: Iterable[Result]) -> None:
         """Replace the file by all results, sorted; at every moment the old or the new content is there.
 
-        Raises OSError with the file's name.
+        Raises OSError.
         """
-        new = self.path.with_name(f".{self.path.name}.new")
+        # a link stays, and the file that it names is replaced
+        path = self.path.resolve()
+        new = path.with_name(f".{path.name}.new")
         try:
-            with self._named_errors(), new.open("wb") as file:
+            with new.open("wb") as file:
                 file.write(encode_all(self.identity, results))
                 file.flush()
                 os.fsync(file.fileno())
-            os.replace(new, self.path)
+            os.replace(new, path)
         finally:
             new.unlink(missing_ok=True)
-
-    @contextlib.contextmanager
-    def _named_errors(self) -> Iterator[None]:
-        """Errors of a full disk do not name a file by themselves."""
-        try:
-            yield
-        except OSError as error:
-            raise OSError(error.errno, error.strerror, str(self.path)) from error
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None

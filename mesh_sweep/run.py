@@ -7,8 +7,8 @@ from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, 
 
 from mesh_sweep.cases import Case
 from mesh_sweep.dispatch import MAX_LONE_DEATHS, Dispatch
-from mesh_sweep.errors import SweepError
-from mesh_sweep.executors import CONTINUE, Workers
+from mesh_sweep.errors import CONTINUE, SweepError
+from mesh_sweep.executors import Workers
 from mesh_sweep.results import Figures, Result
 
 RunCase = Callable[[Case], Figures]
@@ -40,7 +40,7 @@ def run_cases(
             done, _ = wait(running, timeout=0.0 if is_broken else _TICK_S, return_when=FIRST_COMPLETED)
             tick()
             if is_broken or any(
-                isinstance(ended.exception(), BrokenExecutor) for ended in done if not ended.cancelled()
+                isinstance(future.exception(), BrokenExecutor) for future in done if not future.cancelled()
             ):
                 # every future of a broken pool ends at once
                 done = wait(running).done

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+import threading
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 
 from meshctl.cli.context import Session
@@ -67,6 +68,8 @@ class LateReplaced:
 
     opened: Session
     entry: Run
+    # sites report at the same time, and all of them are in one file
+    _guard: threading.Lock = field(default_factory=threading.Lock, repr=False)
 
     def _files(self) -> RunFiles:
         return RunFiles(self.opened.journal.path)
@@ -81,7 +84,7 @@ class LateReplaced:
         files = self._files()
         key = (files.load(self.entry.id, REPLY_KEYS) or {}).get(run.run)
         if key is not None:
-            before = files.load(self.entry.id, BEFORE) or {}
             found = opened_replaced(sealed, ReplyKey.load(str(key)))
             own = {name: state for name, state in found.items() if name in run.nodes}
-            files.save(self.entry.id, BEFORE, {**before, **own})
+            with self._guard:
+                files.save(self.entry.id, BEFORE, {**(files.load(self.entry.id, BEFORE) or {}), **own})

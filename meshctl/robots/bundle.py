@@ -154,8 +154,9 @@ def configuration(
         if keys is not None:
             files.append(File(f"etc/{name}", keys, _SECRET_MODE))
     if fleet.udp_mesh.etc_hosts:
-        hosts = f"{_CURRENT}/bin/udp-mesh hosts --write /etc/hosts"
-        files.append(File(HOSTS_UNIT_NAME, service_unit(units[HOSTS_UNIT_NAME], hosts).encode()))
+        hosts = f"{_CURRENT}/bin/udp-mesh hosts"
+        unit = service_unit(units[HOSTS_UNIT_NAME], f"{hosts} --write /etc/hosts", f"{hosts} --remove /etc/hosts")
+        files.append(File(HOSTS_UNIT_NAME, unit.encode()))
     if has_collector(fleet, robot):
         command = f"{_CURRENT}/bin/{LAUNCHER_NAME}"
         files += [
@@ -211,11 +212,14 @@ def _with_serial_ports(fleet: Fleet, robot: str, unit: str) -> str:
     return unit.replace(_NO_DEVICES, _SERIAL_PORTS)
 
 
-def service_unit(stock: str, start: str) -> str:
-    """A unit of udp_mesh with the start command `start`. Raises ValueError unless it has exactly one ExecStart."""
+def service_unit(stock: str, start: str, after: str = "") -> str:
+    """A unit of udp_mesh with the command `start`, and `after` for when it has ended, if the unit has such a command.
+    Raises ValueError unless it has exactly these."""
     lines = stock.splitlines()
-    places = [number for number, line in enumerate(lines) if line.startswith("ExecStart=")]
-    if len(places) != 1:
-        raise ValueError(f"expected one ExecStart in the unit, found {len(places)}")
-    lines[places[0]] = f"ExecStart={start}"
+    commands = {"ExecStart=": start, **({"ExecStopPost=": after} if after else {})}
+    for key, command in commands.items():
+        places = [number for number, line in enumerate(lines) if line.startswith(key)]
+        if len(places) != 1:
+            raise ValueError(f"expected one {key[:-1]} in the unit, found {len(places)}")
+        lines[places[0]] = f"{key}{command}"
     return "".join(f"{line}\n" for line in lines)

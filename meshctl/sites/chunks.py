@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 MAX_CHUNK_BYTES = 512 << 10
@@ -61,3 +61,13 @@ class Assembler:
             return None
         del self._incomplete[chunk.message]
         return b"".join(found[number] for number in sorted(found))
+
+
+@dataclass(frozen=True, slots=True)
+class StoredMessage:
+    """A message of a stream. `acknowledge` tells the stream to delete it; `later` to deliver it again."""
+
+    subject: str
+    chunk: Chunk
+    acknowledge: Callable[[], None]
+    later: Callable[[float], None]

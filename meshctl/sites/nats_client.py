@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from meshctl.errors import Unreachable
-from meshctl.sites.chunks import HEADER, Chunk, chunks_of, parse_chunk
-from meshctl.sites.nats_errors import HINT, NatsLost, not_installed, translated
+from meshctl.sites.chunks import HEADER, Chunk, StoredMessage, chunks_of, parse_chunk
+from meshctl.sites.nats_errors import HINT, NatsLost, Refusals, not_installed, translated
 from meshctl.sites.nats_login import login_options, tls_context
 
 if TYPE_CHECKING:
@@ -46,22 +46,13 @@ class NatsServer:
     name: str = "meshctl"
 
 
-@dataclass(frozen=True, slots=True)
-class StoredMessage:
-    """A message of a stream. `acknowledge` tells the stream to delete it; `later` to deliver it again."""
-
-    subject: str
-    chunk: Chunk
-    acknowledge: Callable[[], None]
-    later: Callable[[float], None]
-
-
 class NatsClient:
     """`close` ends it. A connection that is lost is made again in the background; meanwhile everything is `NatsLost`.
     The first one is `NatsLost`, too, if it fails; with `waits_at_start` it is tried until it succeeds."""
 
     def __init__(self, server: NatsServer, *, waits_at_start: bool = False) -> None:
         self._server = server
+        self.refusals = Refusals(server.url)
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, name="nats", daemon=True)
         self._thread.start()
@@ -92,7 +83,7 @@ class NatsClient:
             "max_outstanding_pings": 2,
             # what is sent while the server is away is lost, not sent later by surprise
             "pending_size": -1,
-            "error_cb": _ignore,
+            "error_cb": self.refusals.note,
             "inbox_prefix": b"_INBOX",
             **login_options(self._server.credentials),
         }
@@ -111,12 +102,13 @@ class NatsClient:
                 with suppress(Error, OSError):
                     await client.close()
                 if not waits_at_start:
-                    text = str(error) or f"no answer within {CONNECT_S:g} s"
+                    text = str(error) or f"no answer within {CONNECT_S:g} s{self.refusals.reason}"
                     raise NatsLost(f"NATS server {self._server.url}: {text}", hint=HINT) from error
                 await asyncio.sleep(_RECONNECT_S)
 
     def _run(self, work: Coroutine[Any, Any, _T], timeout_s: float | None = ANSWER_S * 2) -> _T:
         """Run in the event loop, and translate errors."""
+        refused = self.refusals.count
         if self._loop.is_closed():
             work.close()
             raise NatsLost(f"NATS server {self._server.url}: the connection was closed")
@@ -125,6 +117,7 @@ class NatsClient:
             return future.result(timeout_s)
         except TimeoutError as error:
             future.cancel()
+            self.refusals.check(refused)
             raise NatsLost(f"NATS server {self._server.url}: no answer", hint=HINT) from error
         except BaseException as error:
             known = translated(error, self._server.url)
@@ -136,7 +129,15 @@ class NatsClient:
     def is_connected(self) -> bool:
         return bool(self._client.is_connected)
 
+    @property
+    def closed_by(self) -> str:
+        """Why the server has ended the connection for good, such as credentials that it no longer accepts; empty if it
+        has not. Only a new client connects again."""
+        return str(self._client.last_error or "no reason given") if self._client.is_closed else ""
+
     def _check_connected(self) -> None:
+        if self.closed_by:
+            raise NatsLost(f"NATS server {self._server.url} closed the connection: {self.closed_by}", hint=HINT)
         if not self.is_connected:
             raise NatsLost(f"NATS server {self._server.url}: the connection is lost", hint=HINT)
 
@@ -277,11 +278,19 @@ class NatsClient:
             self._run(self._jetstream("").purge_stream(stream, subject=subject))
         return found
 
-    def work(self, stream: str, subject: str, domain: str, consumer: str) -> Iterator[StoredMessage]:
+    def work(
+        self,
+        stream: str,
+        subject: str,
+        domain: str,
+        consumer: str,
+        note: Callable[[str], None] = lambda reason: None,
+    ) -> Iterator[StoredMessage]:
         """The messages of a work queue, forever, whether or not it can be reached, and after it was lost and made
-        again."""
+        again. `note` gets why nothing can be fetched, and "" whenever it can."""
         from nats.errors import Error
         from nats.js.api import AckPolicy, ConsumerConfig
+        from nats.js.errors import NotFoundError
 
         async def subscribe() -> JetStreamContext.PullSubscription:
             config = ConsumerConfig(ack_policy=AckPolicy.EXPLICIT, ack_wait=60, max_ack_pending=1000)
@@ -299,12 +308,15 @@ class NatsClient:
                 self._check_connected()
                 if subscription is None:
                     subscription, empty = self._run(subscribe()), 0
+                    note("")
                 messages = self._run(fetch(subscription), ANSWER_S * 3)
                 empty = 0 if messages else empty + 1
                 if empty and empty % _FETCHES == 0:
                     # fetching from a consumer that is gone is no error
                     self._run(subscription.consumer_info())
-            except (Unreachable, Error):
+            except (Unreachable, Error) as error:
+                # the first order makes the stream
+                note("" if isinstance(error.__cause__, NotFoundError) else str(error))
                 subscription = None
                 threading.Event().wait(_RECONNECT_S)
                 continue
@@ -372,20 +384,11 @@ async def _cancel_all() -> None:
     await asyncio.gather(*left, return_exceptions=True)
 
 
-async def _ignore(error: Exception) -> None:
-    """Nothing to do: `is_connected` shows the client's state."""
-
-
-def stream_settings(days: int, max_bytes: int) -> dict[str, Any]:
-    """The limits of a stream."""
-    return {"max_age": days * 86_400, "max_bytes": max_bytes, "duplicate_window": 3600}
-
-
 def shared(server: NatsServer) -> NatsClient:
     """The client of this process for a server. Raises NatsLost."""
     with _shared_lock:
         found = _shared.get(server)
-        if found is None:
+        if found is None or found.closed_by:
             found = _shared[server] = NatsClient(server)
         return found
 

@@ -37,11 +37,11 @@ from meshctl.sites.envelope import (
     signed,
     verified,
 )
-from meshctl.sites.nats_client import NatsServer, shared, stream_settings
+from meshctl.sites.nats_client import NatsServer, shared
 from meshctl.sites.nats_errors import NatsLost
 from meshctl.sites.protocol import SILENCE_S, WorkerError, raise_error
 from meshctl.sites.service import unit_name
-from meshctl.sites.subjects import CONSUMER, SiteSubjects
+from meshctl.sites.subjects import CONSUMER, SiteSubjects, stream_settings
 from meshctl.sites.uplink import Greeting, Parcel, SiteOffline, Uplink, greeting_of
 
 # How long the hub keeps orders and events, whatever their own limits are.
@@ -126,7 +126,7 @@ class NatsUplink(Uplink):
         data = self._request(nonce, key, request)
         if request["do"] == "plan":
             self._planned.append(str(request["run"]))
-        inbox, assembler = self._client.new_inbox(), Assembler()
+        inbox, assembler, refused = self._client.new_inbox(), Assembler(), self._client.refusals.count
         with self._client.listening(inbox) as received:
             self._client.send_chunks(self._subjects.ask, nonce, data, inbox)
             heard_s = time.monotonic()
@@ -134,6 +134,7 @@ class NatsUplink(Uplink):
                 try:
                     message = received.get(timeout=_POLL_S)
                 except queue.Empty:
+                    self._client.refusals.check(refused, self._subjects.ask, inbox)
                     self._check_heard(heard_s)
                     continue
                 headers = message.headers or {}

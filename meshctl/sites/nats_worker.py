@@ -24,7 +24,7 @@ from meshctl.device.connection import Credentials, fingerprint_of
 from meshctl.device.trust import parse_key
 from meshctl.errors import InputError, MeshctlError, Unreachable
 from meshctl.sites import runner
-from meshctl.sites.chunks import HEADER, Assembler, parse_chunk
+from meshctl.sites.chunks import HEADER, Assembler, StoredMessage, parse_chunk
 from meshctl.sites.envelope import (
     EVENTS,
     REPLY,
@@ -35,7 +35,8 @@ from meshctl.sites.envelope import (
     signed,
     verified,
 )
-from meshctl.sites.nats_client import NatsClient, StoredMessage, stream_settings
+from meshctl.sites.nats_client import NatsClient
+from meshctl.sites.nats_errors import NatsLost
 from meshctl.sites.order import (
     ClockBehind,
     Order,
@@ -46,8 +47,8 @@ from meshctl.sites.order import (
     operator_keys,
 )
 from meshctl.sites.protocol import BEAT_S, MAX_EVENTS_BYTES, encode
-from meshctl.sites.runs import RunDirectory, SiteDirectory, read_json, write_json
-from meshctl.sites.subjects import CONSUMER, SiteSubjects
+from meshctl.sites.runs import RunDirectory, SiteDirectory, read_json, replace_bytes, write_json
+from meshctl.sites.subjects import CONSUMER, SiteSubjects, stream_settings
 from meshctl.sites.worker import Worker, run_command
 from meshctl.wording import counted
 
@@ -66,6 +67,8 @@ _CHECK_S = 30.0
 _UNRECORDED = 1000
 _CLOCK_RETRY_S = 30.0
 _RETRY_S = 1.0
+# A loop that fails again after so long has worked in between: the same reason is a new one.
+_WORKED_S = 60.0
 # Requests that change what the worker is, or that NATS has another way for.
 _NOT_OVER_NATS = ("install", "start", "follow")
 
@@ -89,7 +92,8 @@ class NatsWorker:
         return SiteSubjects(self.directory.fleet, self.directory.site)
 
     def serve(self) -> None:
-        """Serve until the process is ended. Raises InputError for a site without a key."""
+        """Serve until the process is ended. Raises InputError for a site without a key, and NatsLost once the server
+        has ended the connection for good: systemd starts a new worker, which connects again."""
         if not self.directory.key.exists():
             name = self.directory.site
             raise InputError(f"{self.directory.key}: missing", hint=f"run `meshctl sites install {name}`")
@@ -101,17 +105,23 @@ class NatsWorker:
         for thread in threads:
             thread.start()
         _log(f"serving {self.directory.fleet}/{self.directory.site}")
-        for thread in threads:
-            thread.join()
+        while not (reason := self.client.closed_by):
+            time.sleep(_RETRY_S)
+        raise NatsLost(f"the leaf node closed the connection: {reason}")
 
     def _repeat(self, loop: Callable[[], None]) -> None:
+        complaint = _Complaint()
         while True:
+            began_s, text = time.monotonic(), ""
             try:
                 loop()
             except MeshctlError as error:
-                _log(str(error))
+                text = str(error)
             except OSError as error:
-                _log(f"{error.filename or 'gateway'}: {error.strerror or error}")
+                text = f"{error.filename or 'gateway'}: {error.strerror or error}"
+            if time.monotonic() - began_s > _WORKED_S:
+                complaint("")
+            complaint(text)
             time.sleep(_RETRY_S)
 
     def _beats(self) -> None:
@@ -172,7 +182,8 @@ class NatsWorker:
         assembler = Assembler()
         pieces: dict[str, list[StoredMessage]] = {}
         subjects = self._subjects
-        for stored in self.client.work(subjects.order_stream, subjects.orders, self.hub, CONSUMER):
+        complaint = _Complaint("no orders from the hub: ", "orders from the hub again")
+        for stored in self.client.work(subjects.order_stream, subjects.orders, self.hub, CONSUMER, complaint):
             pieces.setdefault(stored.chunk.message, []).append(stored)
             whole = assembler.add(stored.chunk)
             if whole is None:
@@ -213,14 +224,17 @@ class NatsWorker:
             _log(f"run {order.run} of {order.operator} ({order.command}) is refused: {error}")
 
     def _prepare(self, run: RunDirectory, order: Order, message: Mapping[str, Any]) -> None:
-        """Unpack what came with an order whose plan is not here, or not anymore."""
+        """Unpack what came with an order whose plan is not here, or not anymore, or in part: after a full disk, or a
+        power cut in between."""
         images = {str(path): str(sha256) for path, sha256 in dict(message["images"]).items()}
         if order.expires_s is None:
             raise OrderRefused("an order without an expiry cannot wait for its site")
         if order.images_sha256 != images_sha256(images):
             raise OrderRefused("the order is for other firmware images than those it came with")
-        if run.inventory.exists():
+        is_whole = (run.part_sha256(), run.plan_sha256()) == (order.part_sha256, order.plan_sha256)
+        if run.inventory.exists() and is_whole and (run.replaced.exists() or not order.reply_to):
             return
+        run.discard()
         part = base64.b64decode(str(message["part"]), validate=True)
         if missing := self.directory.missing_images(images.values()):
             raise OrderRefused(
@@ -232,7 +246,7 @@ class NatsWorker:
             options = ["--reconnect", "-i", str(run.inventory), *runner.key_options(self.directory)]
             run_command(self.directory, run, self.environ, "apply", str(run.plan), "--dry-run", "--json", *options)
             replaced = json.dumps(run.taken_replaced()).encode()
-            run.replaced.write_bytes(sealed_for_reply(replaced, order.reply_to))
+            replace_bytes(run.replaced, sealed_for_reply(replaced, order.reply_to))
 
     # -- events
 
@@ -334,6 +348,21 @@ class _Replies:
 
     def flush(self) -> None:
         """Each line is sent as it is written."""
+
+
+@dataclass(slots=True)
+class _Complaint:
+    """Logs a reason once while it stays the same, which may be for days; an empty one ends it."""
+
+    prefix: str = ""
+    ended: str = ""
+    _last: str = ""
+
+    def __call__(self, reason: str) -> None:
+        line = f"{self.prefix}{reason}" if reason else self.ended
+        if reason != self._last and line:
+            _log(line)
+        self._last = reason
 
 
 def _log(text: str) -> None:

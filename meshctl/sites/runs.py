@@ -378,10 +378,14 @@ def write_json(path: Path, value: Mapping[str, object]) -> None:
 
 
 def replace_text(path: Path, text: str) -> None:
+    replace_bytes(path, text.encode())
+
+
+def replace_bytes(path: Path, data: bytes) -> None:
     """Replace a file in one rename, so that a reader finds the whole of it, or of the earlier one."""
     new = path.with_name(f".{path.name}.new")
-    with new.open("w", encoding="utf-8") as file:
-        file.write(text)
+    with new.open("wb") as file:
+        file.write(data)
         file.flush()
         os.fsync(file.fileno())
     new.replace(path)

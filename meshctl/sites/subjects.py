@@ -1,4 +1,4 @@
-"""The names of a site's subjects and streams in NATS. Pure.
+"""The names of a site's subjects and streams in NATS, and the limits of streams. Pure.
 
 meshctl.FLEET.SITE.ask          requests of operators who wait for the answer: not stored
 meshctl.FLEET.SITE.beat         the worker is online: every few seconds, not stored
@@ -10,6 +10,7 @@ meshctl.FLEET.SITE.runs.RUN     events of runs, in the stream `meshctl+FLEET+SIT
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 # The consumer of a site's orders, which its worker makes.
 CONSUMER = "worker"
@@ -57,3 +58,8 @@ class SiteSubjects:
 
     def _stream(self, kind: str) -> str:
         return "+".join((*self._prefix.split("."), kind))
+
+
+def stream_settings(days: int, max_bytes: int) -> dict[str, Any]:
+    """The limits of a stream."""
+    return {"max_age": days * 86_400, "max_bytes": max_bytes, "duplicate_window": 3600}

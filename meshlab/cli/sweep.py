@@ -53,7 +53,12 @@ def sweep(
     out: Annotated[Path | None, typer.Option("--out", help="Results; default: MISSION-sweep.jsonl.")] = None,
     jobs: Annotated[int, typer.Option("--jobs", min=0, max=1024, help="Processes; 0: one for each core.")] = 0,
     dask: Annotated[
-        str, typer.Option("--dask", metavar="ADDRESS", help="Run on a Dask cluster: tcp://host:8786.")
+        str,
+        typer.Option(
+            "--dask",
+            metavar="ADDRESS",
+            help="Run on a Dask cluster: its address, such as tcp://host:8786, or the JSON file of its scheduler.",
+        ),
     ] = "",
     executor: Annotated[
         str, typer.Option("--executor", metavar="MODULE:NAME", help="Run on another concurrent.futures.Executor.")

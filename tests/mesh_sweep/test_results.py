@@ -56,7 +56,11 @@ def test_a_line_that_is_torn_anywhere_is_left_out() -> None:
             b"precious",
             "f:1: expected a result of scenario mine (0123456789abcdef) at revision 1.0-abc, found 'precious'",
         ),
-        (b"precious\n", "f:1: expected a result of a sweep (one JSON object), found 'precious'"),
+        (
+            b"precious\n",
+            "f:1: expected a result of a sweep (one JSON object), found 'precious'; if the file is damaged, "
+            "remove this line, and its case runs again",
+        ),
         (b"[1]\n", "f:1: expected a result of a sweep (one JSON object), found '[1]'"),
         (b'{"scenario": "mine"}\n', "f:1: expected a result of a sweep (one JSON object)"),
         (encode(OURS, ONE) + b"\xff\n", "f:2: expected a result of a sweep"),
@@ -96,6 +100,18 @@ def test_the_file_is_repaired_locked_appended_and_sorted(tmp_path: Path) -> None
     assert [one.name for one in tmp_path.iterdir()] == ["r.jsonl"]
 
 
+def test_a_link_to_the_results_stays(tmp_path: Path) -> None:
+    (tmp_path / "disk").mkdir()
+    path, target = tmp_path / "r.jsonl", tmp_path / "disk/results.jsonl"
+    path.symlink_to(target)
+    with ResultsFile(path, OURS) as file:
+        file.append(TWO)
+        file.append(ONE)
+        file.finish([TWO, ONE])
+    assert path.is_symlink()
+    assert target.read_bytes() == encode(OURS, ONE) + encode(OURS, TWO)
+
+
 def test_a_refused_file_keeps_its_content(tmp_path: Path) -> None:
     path = tmp_path / "notes.txt"
     path.write_bytes(b"notes without an end")
@@ -111,11 +127,11 @@ def test_a_full_disk_is_reported_with_the_file_and_tears_at_most_one_line(tmp_pa
         file.append(ONE)
         resource.setrlimit(resource.RLIMIT_FSIZE, (path.stat().st_size + 20, limits[1]))
         try:
-            with pytest.raises(OSError) as raised:
+            with pytest.raises(SweepError) as raised:
                 file.append(TWO)
         finally:
             resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    assert raised.value.filename == str(path)
+    assert str(raised.value) == f"{path}: File too large; the results so far are kept, and the same command continues"
     with ResultsFile(path, OURS) as file:
         assert file.stored.results == (ONE,)
         assert file.repaired_bytes == 20

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from mesh_sweep import executors
 from mesh_sweep.cases import Case
 from mesh_sweep.errors import SweepError
 from mesh_sweep.executors import DaskWorkers, OtherWorkers, ProcessWorkers
@@ -83,5 +84,16 @@ def test_an_invalid_scheduler_address_is_reported() -> None:
     with pytest.raises(SweepError, match="--dask: expected a Dask scheduler at nowhere://x:1, found none: "):
         DaskWorkers("nowhere://x:1").open()
     # without a traceback half a minute later
-    with pytest.raises(SweepError, match="--dask: expected an address such as tcp://host:8786, found 'cluster'"):
+    with pytest.raises(SweepError, match=r"--dask: expected an address such as tcp://host:8786, .* found 'cluster'"):
         DaskWorkers("cluster").open()
+    with pytest.raises(SweepError, match="--dask tls://x:1: expected certificates for TLS in Dask's configuration"):
+        DaskWorkers("tls://x:1").open()
+
+
+def test_a_scheduler_file_that_does_not_come_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(executors, "_FILE_POLLS", 2)
+    half = tmp_path / "half.json"
+    half.write_text('{"type": "Sched')
+    for file in (half, tmp_path / "none.json"):
+        with pytest.raises(SweepError, match=f"--dask {file}: expected the file of a Dask scheduler, found none"):
+            DaskWorkers(str(file)).open()

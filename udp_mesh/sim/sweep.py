@@ -144,7 +144,10 @@ def parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     made.add_argument("--out", type=Path, metavar="FILE", help="results (default SCENARIO-sweep.jsonl)")
     made.add_argument("--jobs", type=_jobs, default=0, metavar="N", help="processes (default: one for each core)")
-    made.add_argument("--dask", default="", metavar="ADDRESS", help="run on a Dask cluster, such as tcp://host:8786")
+    made.add_argument(
+        "--dask", default="", metavar="ADDRESS",
+        help="run on a Dask cluster: its address, such as tcp://host:8786, or the JSON file of its scheduler",
+    )  # fmt: skip
     made.add_argument(
         "--executor", default="", metavar="MODULE:NAME", help="run on another concurrent.futures.Executor"
     )

@@ -41,6 +41,11 @@ def test_peer_names_resolve_on_a_robot_while_its_daemon_runs(fleet: RobotFleet) 
     fleet.shell("husky1", "sed -i '/10.9.9.9/d' /etc/hosts")
     eventually(lambda: _address_of(fleet, "husky2", on="husky1") == husky2)
 
+    # killed and not started again, it leaves no names
+    fleet.shell("husky1", "systemctl kill -s KILL udp-mesh-hosts && systemctl stop udp-mesh-hosts")
+    assert fleet.shell("husky1", "cat /etc/hosts") == before
+    fleet.shell("husky1", "systemctl start udp-mesh-hosts")
+
     # killed, the service comes back; with the daemon gone, or uninstalled, nothing of it remains
     fleet.shell("husky1", "systemctl kill -s KILL udp-mesh-hosts")
     eventually(lambda: fleet.shell("husky1", "systemctl is-active udp-mesh-hosts || true").strip() == "active")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import signal
 import subprocess
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -43,16 +44,21 @@ class NatsServerProcess:
         self.store = directory / f"{name}-store"
         jetstream = {"store_dir": str(self.store), "domain": domain, **limits}
         config = {"listen": f"127.0.0.1:{self.port}", "server_name": name, "jetstream": jetstream, **more}
-        self._config = directory / f"{name}.conf"
+        self.config = directory / f"{name}.conf"
         # JSON is a configuration of nats-server
-        self._config.write_text(json.dumps(config))
+        self.config.write_text(json.dumps(config))
         self._log = directory / f"{name}.log"
         self.start()
 
     def start(self) -> None:
         with self._log.open("ab") as log:
-            self.process = subprocess.Popen([PROGRAM, "-c", str(self._config)], stdout=log, stderr=log)
+            self.process = subprocess.Popen([PROGRAM, "-c", str(self.config)], stdout=log, stderr=log)
         until(lambda: "Server is ready" in self._log.read_text(), f"a server in {self._log}", wait_s=WAIT_S)
+
+    def reload(self, config: str) -> None:
+        """Let the running server read another configuration."""
+        self.config.write_text(config)
+        self.process.send_signal(signal.SIGHUP)
 
     def stop(self) -> None:
         self.process.kill()

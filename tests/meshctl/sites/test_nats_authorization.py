@@ -17,9 +17,9 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 
 from meshctl.errors import InputError
-from meshctl.sites.nats_client import NatsClient, NatsServer, stream_settings
+from meshctl.sites.nats_client import NatsClient, NatsServer
 from meshctl.sites.nats_errors import NatsLost
-from meshctl.sites.subjects import SiteSubjects
+from meshctl.sites.subjects import SiteSubjects, stream_settings
 from tests.meshctl.monitor.prometheus_program import free_tcp_port
 from tests.meshctl.sites.nats_servers import PROGRAM
 from tests.waiting import until

@@ -18,11 +18,11 @@ from meshctl.errors import MeshctlError
 from meshctl.inventory import load_fleet
 from meshctl.model import Fleet
 from meshctl.nodes.connections import ConnectionPool
-from meshctl.sites.nats_client import NatsClient, NatsServer, stream_settings
+from meshctl.sites.nats_client import NatsClient, NatsServer
 from meshctl.sites.nats_uplink import NatsUplink
 from meshctl.sites.nats_worker import NatsWorker
 from meshctl.sites.runs import RunDirectory, SiteDirectory, write_json
-from meshctl.sites.subjects import CONSUMER, SiteSubjects
+from meshctl.sites.subjects import CONSUMER, SiteSubjects, stream_settings
 from meshctl.sites.uplink import SiteOffline
 from tests.meshctl.device.servers import keypair, public
 from tests.meshctl.sites.nats_servers import NatsServerProcess, NatsSites

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import hashlib
 import json
 import zlib
 from dataclasses import asdict, replace
@@ -30,7 +31,7 @@ from meshctl.sites.envelope import (
     verified,
 )
 from meshctl.sites.nats_client import NatsClient
-from meshctl.sites.nats_worker import NatsWorker
+from meshctl.sites.nats_worker import NatsWorker, _Complaint
 from meshctl.sites.order import ClockBehind, Order, OrderRefused, images_sha256, sign_order
 from meshctl.sites.runs import RunDirectory, SiteDirectory, read_json
 from tests.meshctl.device.servers import keypair, public
@@ -38,6 +39,10 @@ from tests.meshctl.device.servers import keypair, public
 _RUN = "0123456789abcdef"
 _PART = tar_of([TarMember("fleet.yaml", b"meshctl: 1\n")])
 _NOW_S = 1_800_000_000.0
+
+
+def _sha256(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()
 
 
 class Site:
@@ -91,6 +96,38 @@ def test_an_order_is_executed_once_however_often_it_is_delivered(site: Site) -> 
     (site.directory.root / "forgotten").write_text(f"{_RUN}\n")
     site.execute(site.message(site.order))
     assert site.started == [_RUN]
+
+
+@pytest.mark.parametrize("left", [("inventory",), ("inventory", "plan.json")], ids=["no plan", "half a plan"])
+def test_an_order_whose_unpacking_was_cut_is_unpacked_again(site: Site, left: tuple[str, ...]) -> None:
+    """A full disk or a power cut ends it anywhere; the hub delivers the order again."""
+    ordered = replace(site.order, part_sha256=_sha256(_PART), plan_sha256=_sha256(b"{}"))
+    site.run.inventory.mkdir(parents=True)
+    if "plan.json" in left:
+        site.run.plan.write_bytes(b"{")
+    site.execute(site.message(ordered))
+    assert site.started == [_RUN]
+    assert site.run.plan_sha256() == ordered.plan_sha256
+    assert site.run.part_sha256() == ordered.part_sha256
+    assert (site.run.inventory / "fleet.yaml").exists()
+
+
+def test_an_order_for_what_was_planned_here_is_not_unpacked_again(site: Site) -> None:
+    ordered = replace(site.order, part_sha256=_sha256(_PART), plan_sha256=_sha256(b"{}"))
+    site.run.create(_PART, {})
+    site.run.plan.write_bytes(b"{}")
+    (site.run.inventory / "planned here").touch()
+    site.execute(site.message(ordered))
+    assert site.started == [_RUN]
+    assert (site.run.inventory / "planned here").exists()
+
+
+def test_a_reason_that_stays_the_same_is_logged_once(capsys: pytest.CaptureFixture[str]) -> None:
+    complaint = _Complaint("no orders: ", "orders again")
+    for reason in ("", "no answer", "no answer", "no room", "", "", "no answer"):
+        complaint(reason)
+    logged = ["no orders: no answer", "no orders: no room", "orders again", "no orders: no answer"]
+    assert capsys.readouterr().err.splitlines() == logged
 
 
 def test_an_expired_order_is_refused_for_ever_and_leaves_no_secret(site: Site) -> None:

@@ -209,6 +209,22 @@ def test_an_interrupted_sweep_continues_with_the_same_bytes(scenario: Path, one_
     assert out.read_bytes() == one_process
 
 
+@contextmanager
+def dask_scheduler(address_file: Path) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """A Dask scheduler on loopback, with its address, which is also in the file."""
+    with started(
+        sys.executable, "-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "0",
+        "--no-dashboard", "--scheduler-file", str(address_file),
+    ) as scheduler:  # fmt: skip
+
+        def is_up() -> bool:
+            assert scheduler.poll() is None
+            return address_file.exists() and address_file.read_text().endswith("}")
+
+        until(is_up, "the Dask scheduler", wait_s=120)
+        yield scheduler, json.loads(address_file.read_text())["address"]
+
+
 def test_a_dask_cluster_that_loses_a_worker_gives_the_same_bytes(
     scenario: Path, tmp_path: Path, one_process: bytes
 ) -> None:
@@ -217,17 +233,7 @@ def test_a_dask_cluster_that_loses_a_worker_gives_the_same_bytes(
     words = [str(scenario), "--seeds", str(CASES)]
     out, address_file = tmp_path / "dask.jsonl", tmp_path / "scheduler.json"
     with ExitStack() as stack:
-        scheduler = stack.enter_context(
-            started(sys.executable, "-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "0",
-                    "--no-dashboard", "--scheduler-file", str(address_file))
-        )  # fmt: skip
-
-        def is_up() -> bool:
-            assert scheduler.poll() is None
-            return address_file.exists() and address_file.read_text().endswith("}")
-
-        until(is_up, "the Dask scheduler", wait_s=120)
-        address = json.loads(address_file.read_text())["address"]
+        _, address = stack.enter_context(dask_scheduler(address_file))
         first, _ = (
             stack.enter_context(
                 started(sys.executable, "-m", "distributed.cli.dask_worker", address, "--host", "127.0.0.1",
@@ -235,9 +241,23 @@ def test_a_dask_cluster_that_loses_a_worker_gives_the_same_bytes(
             )
             for _ in range(2)
         )  # fmt: skip
-        sweep = stack.enter_context(started(*COMMAND, "sim", "sweep", *words, "--dask", address, "--out", str(out)))
+        cluster = ["--dask", str(address_file)]
+        sweep = stack.enter_context(started(*COMMAND, "sim", "sweep", *words, *cluster, "--out", str(out)))
         wait_for_lines(out, 2, sweep)
         first.kill()
         output, _ = sweep.communicate(timeout=200)
         assert sweep.returncode == 0, output
     assert out.read_bytes() == one_process
+
+
+def test_a_dask_scheduler_that_is_killed_ends_the_sweep_with_one_line(scenario: Path, tmp_path: Path) -> None:
+    with dask_scheduler(tmp_path / "scheduler.json") as (scheduler, address):
+        words = [*COMMAND, "sim", "sweep", str(scenario), "--seeds", "2", "--dask", address]
+        with started(*words) as sweep:
+            assert sweep.stdout is not None
+            assert sweep.stdout.readline() == f"{address} has no workers: waiting for one\n"
+            scheduler.kill()
+            output, _ = sweep.communicate(timeout=120)
+    assert sweep.returncode == 2
+    (line,) = output.splitlines()
+    assert line.endswith("the results so far are kept, and the same command continues")

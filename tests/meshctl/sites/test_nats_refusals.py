@@ -1,0 +1,92 @@
+"""Credentials that lack a permission at a real hub: what is refused is named, and no order is lost."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from meshctl.device.trust import TrustStore
+from meshctl.errors import ExitCode
+from meshctl.inventory import load_fleet
+from meshctl.nodes.connections import ConnectionPool
+from meshctl.sites.nats_client import NatsClient, NatsServer
+from meshctl.sites.nats_errors import NatsLost
+from meshctl.sites.nats_uplink import NatsUplink
+from meshctl.sites.runs import SiteDirectory
+from meshctl.sites.subjects import SiteSubjects, stream_settings
+from tests.meshctl.device.servers import keypair, public
+from tests.meshctl.sites.nats_servers import NatsServerProcess
+
+pytestmark = [pytest.mark.xdist_group("nats"), pytest.mark.timeout(120)]
+_NORTH = SiteSubjects("mines", "north")
+_DENIED = (_NORTH.ask, "$JS.API.STREAM.CREATE.>", "_INBOX.refused.>")
+INVENTORY = """\
+meshctl: 1
+fleet: mines
+country: US
+operators: {{ssh_keys: ["{key}"]}}
+nats: {{url: {hub}}}
+sites: {{north: {{nats: {{}}, ssh: {{key_files: ["{private}"]}}, worker_key: {worker}}}}}
+nodes: {{}}
+"""
+
+
+@pytest.fixture
+def hub(tmp_path: Path) -> Iterator[NatsServerProcess]:
+    permissions = {"publish": {"deny": list(_DENIED)}, "subscribe": {"deny": ["meshctl.>"]}}
+    user = {"user": "operator", "password": "p", "permissions": permissions}
+    accounts = {"MESH": {"jetstream": "enabled", "users": [user]}}
+    server = NatsServerProcess(tmp_path / "hub", "hub", "hub", {"accounts": accounts, "no_auth_user": "operator"})
+    yield server
+    server.stop()
+
+
+def test_a_request_that_is_not_permitted_is_named_instead_of_a_silent_site(
+    hub: NatsServerProcess, tmp_path: Path
+) -> None:
+    private = keypair(tmp_path / "operator")
+    key = public(private).read_text().strip()
+    worker = SiteDirectory.of("mines/north", {"XDG_STATE_HOME": str(tmp_path)}).install([key])
+    path = tmp_path / "fleet.yaml"
+    path.write_text(INVENTORY.format(key=key, hub=hub.url, private=private, worker=worker))
+    fleet = load_fleet(path)
+    access = ConnectionPool(fleet, TrustStore(tmp_path / "known_hosts"), use_agent=False)
+    with pytest.raises(NatsLost, match=f'permissions violation for publish to "{_NORTH.ask}"') as raised:
+        NatsUplink(fleet, fleet.sites["north"], access)
+    assert "permanent-sites.md" in raised.value.hint
+
+
+def test_a_worker_that_its_leaf_node_no_longer_accepts_ends(tmp_path: Path) -> None:
+    """nats-py ends such a connection for good: the worker would stay, and be silent, also once the credentials are
+    right again. Its unit starts another one."""
+    environ = {**os.environ, "XDG_STATE_HOME": str(tmp_path)}
+    site = SiteDirectory.of("mines/north", environ)
+    site.install([public(keypair(tmp_path / "operator")).read_text().strip()])
+    leaf = NatsServerProcess(tmp_path / "leaf", "leaf", "north", {})
+    command = [sys.executable, "-m", "meshctl", "worker", "mines/north", "--nats", leaf.url]
+    try:
+        with subprocess.Popen(command, env=environ, stderr=subprocess.PIPE, text=True) as worker:
+            assert worker.stderr is not None
+            assert worker.stderr.readline() == "serving mines/north\n"
+            config = json.loads(leaf.config.read_text())
+            leaf.reload(json.dumps({**config, "authorization": {"user": "a", "password": "b"}}))
+            assert worker.wait(60) == ExitCode.UNREACHABLE
+            assert "error: the leaf node closed the connection: nats: authorization failed" in worker.stderr.read()
+    finally:
+        leaf.stop()
+
+
+def test_a_stream_that_may_not_be_made_is_named(hub: NatsServerProcess) -> None:
+    with closing(NatsClient(NatsServer(hub.url))) as client:
+        with pytest.raises(NatsLost, match=r'permissions violation for publish to "\$js\.api\.stream\.create'):
+            client.ensure_stream(name=_NORTH.order_stream, subjects=[_NORTH.orders], **stream_settings(1, 1 << 20))
+        # what was refused earlier is not the reason for something else, nor what another site was refused
+        client.refusals.check(client.refusals.count)
+        client.refusals.check(0, _NORTH.ask)
