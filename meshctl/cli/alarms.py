@@ -18,12 +18,12 @@ from meshctl.cli.monitor_history import HistoryFile, history_path
 from meshctl.cli.output import echo, echo_error, echo_json
 from meshctl.errors import ExitCode, InputError
 from meshctl.fleet.process import owner
-from meshctl.inventory.suggest import did_you_mean
 from meshctl.monitor.alarm_log import FLEET, LoggedAlarm, Silence
 from meshctl.monitor.history_file import ANY
 from meshctl.monitor.store import FrameStore
 from meshctl.report.duration import duration
 from meshctl.status.alarm_codes import CODES
+from meshctl.suggest import did_you_mean
 
 app = typer.Typer(help="List, acknowledge and silence the alarms that `meshctl monitor` records.", no_args_is_help=True)
 

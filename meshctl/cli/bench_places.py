@@ -12,8 +12,8 @@ import typer
 from meshctl.apply.bootstrap import FACTORY_ADDRESS, BenchTarget
 from meshctl.cli.extensions import LabFleet
 from meshctl.errors import InputError
-from meshctl.inventory.suggest import did_you_mean
 from meshctl.model import Fleet, Node
+from meshctl.suggest import did_you_mean
 
 At = Annotated[
     list[str] | None,

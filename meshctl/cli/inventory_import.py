@@ -20,8 +20,8 @@ from meshctl.errors import InputError
 from meshctl.inventory.csv_table import COLUMNS, NodeEdit, Row, checked, edits, read
 from meshctl.inventory.edit import Editor, FileEdit, save
 from meshctl.inventory.load import load_fleet
-from meshctl.inventory.suggest import did_you_mean
 from meshctl.model import Fleet
+from meshctl.suggest import did_you_mean
 from meshctl.wording import counted
 
 app = typer.Typer(help="Import nodes from a CSV table (the default), an existing device, its `uci export`, or NetBox.")

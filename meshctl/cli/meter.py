@@ -23,13 +23,13 @@ from meshctl.cli.live_screen import live_screen
 from meshctl.cli.output import echo, echo_json
 from meshctl.cli.voice import Voice
 from meshctl.errors import ExitCode, InputError
-from meshctl.inventory.suggest import did_you_mean
 from meshctl.nodes.link_snapshots import HopMargins, LinkPoller, assemble, own_radios
 from meshctl.placement.margin import MAX_SHARED_HOPS, required_snr_db
 from meshctl.placement.meter import Meter, Position, Reading
 from meshctl.placement.reading import is_due_to_speak, line, page, reading_json, style_of, words
 from meshctl.robots.local_daemon import DaemonError, LocalDaemon, socket_path
 from meshctl.robots.position_facts import positions_in
+from meshctl.suggest import did_you_mean
 
 DEFAULT_LOAD_MBIT_S = 2.0
 # Shorter ways between two positions are the noise of an odometry.

@@ -23,7 +23,6 @@ from meshctl.device.trust import AcceptAnyKey, HostKey
 from meshctl.device.upload import UploadProgress
 from meshctl.errors import ExitCode, InputError, MeshctlError
 from meshctl.inventory.edit import Editor, save
-from meshctl.inventory.suggest import did_you_mean
 from meshctl.model import Site
 from meshctl.nodes.connections import ConnectionPool
 from meshctl.nodes.site_gateways import PIN_PREFIX
@@ -31,6 +30,7 @@ from meshctl.sites.gateway import Gateway, WorkerRelease, build_release, downloa
 from meshctl.sites.nats_uplink import NatsUplink
 from meshctl.sites.service import start_service, unit, unit_name
 from meshctl.sites.ssh_uplink import SshUplink
+from meshctl.suggest import did_you_mean
 
 app = typer.Typer(no_args_is_help=True)
 

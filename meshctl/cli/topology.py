@@ -13,10 +13,10 @@ from meshctl.cli.context import InventoryPath, KeyFiles, Lab, Limit, Nodes, sele
 from meshctl.cli.fleet_view import CONNECT_S, Direct, Timeout, collect, open_fleet_view
 from meshctl.cli.output import echo
 from meshctl.errors import ExitCode, InputError
-from meshctl.inventory.suggest import did_you_mean
 from meshctl.model import Backend
 from meshctl.status import assess
 from meshctl.status.topology_formats import FORMATS, TopologyView, directions
+from meshctl.suggest import did_you_mean
 from meshctl.topology import observed_graph
 from meshctl.topology.cells import link_cells, mesh_reports
 

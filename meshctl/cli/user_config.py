@@ -26,7 +26,7 @@ import typer
 
 from meshctl.cli.commands import COMMANDS
 from meshctl.errors import InputError
-from meshctl.inventory.suggest import did_you_mean
+from meshctl.suggest import did_you_mean
 
 _OPTIONS = ("inventory", "key", "log_file", "verbose")
 _COLORS = ("auto", "never")

@@ -33,7 +33,6 @@ from meshctl.inventory.layers import NodeSpec
 from meshctl.inventory.nodes import build_nodes, fixed_position, ssh_settings, ssh_values
 from meshctl.inventory.provenance import Provenance
 from meshctl.inventory.ranges import MAX_NAMES, BadRange, expand
-from meshctl.inventory.suggest import did_you_mean
 from meshctl.inventory.thin import thin_links, thin_ports
 from meshctl.inventory.topics import topic_of
 from meshctl.inventory.tree import MappingNode, descend, position_of
@@ -60,6 +59,7 @@ from meshctl.model import (
     UdpMesh,
 )
 from meshctl.model.ip import IpAddress, IpInterface
+from meshctl.suggest import did_you_mean
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,11 +21,11 @@ from meshctl.inventory import codes
 from meshctl.inventory.compose import printable
 from meshctl.inventory.documents.node import NodeDocument
 from meshctl.inventory.fields import Name
-from meshctl.inventory.suggest import did_you_mean
 from meshctl.inventory.tree import Plain
 from meshctl.inventory.validate import expected_value
 from meshctl.inventory.yaml_text import Value
 from meshctl.model import Fleet, Node
+from meshctl.suggest import did_you_mean
 
 NODE = "node"
 _GETTERS: Mapping[str, Callable[[Node], str]] = {

@@ -14,8 +14,8 @@ from meshctl.inventory.compose import printable
 from meshctl.inventory.documents import InventoryDocument, NodeDocument, NodeLayer
 from meshctl.inventory.fields import is_name
 from meshctl.inventory.ranges import MAX_NAMES, BadRange, expand, is_range
-from meshctl.inventory.suggest import did_you_mean
 from meshctl.inventory.tree import MappingNode, Tree, descend, position, position_of
+from meshctl.suggest import did_you_mean
 
 
 @dataclass(frozen=True, slots=True, eq=False)

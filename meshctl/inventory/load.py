@@ -13,9 +13,9 @@ from meshctl.inventory.codes import UNKNOWN_MESH
 from meshctl.inventory.include import read_files
 from meshctl.inventory.layers import resolve_layers
 from meshctl.inventory.source import Reader, read_bytes
-from meshctl.inventory.suggest import did_you_mean
 from meshctl.inventory.validate import validate
 from meshctl.model import Fleet
+from meshctl.suggest import did_you_mean
 
 _NO_ENVIRON: Mapping[str, str] = MappingProxyType({})
 

@@ -19,7 +19,6 @@ from meshctl.inventory.addresses import AddressRule, AddressValue, BadAddress
 from meshctl.inventory.documents import LanFilterLayer, PositionDocument, RadioLayer, SshLayer
 from meshctl.inventory.file_paths import from_inventory
 from meshctl.inventory.layers import Layer, NodeSpec
-from meshctl.inventory.suggest import did_you_mean
 from meshctl.inventory.tree import Tree, child
 from meshctl.model import (
     Band,
@@ -34,6 +33,7 @@ from meshctl.model import (
     SshSettings,
 )
 from meshctl.model.ip import IpAddress, IpInterface, IpNetwork
+from meshctl.suggest import did_you_mean
 
 # Placeholder in a template until the node's address is known.
 _NO_ADDRESS = IPv4Interface("0.0.0.0/0")

@@ -16,9 +16,9 @@ from meshctl.errors import InputError
 from meshctl.file_access import special_file
 from meshctl.inventory.compose import compose
 from meshctl.inventory.source import Source
-from meshctl.inventory.suggest import did_you_mean
 from meshctl.inventory.tree import MappingNode, Scalar
 from meshctl.model import Secret, SecretKind, SecretRef
+from meshctl.suggest import did_you_mean
 
 if TYPE_CHECKING:
     import pyrage

@@ -24,8 +24,8 @@ from typing import TypeVar
 
 from meshctl.errors import InputError
 from meshctl.inventory.ranges import BadRange, expand
-from meshctl.inventory.suggest import did_you_mean
 from meshctl.model import Fleet, Node, NodeState, Robot
+from meshctl.suggest import did_you_mean
 
 LIST_HINT = "run `meshctl inventory list` to list all nodes"
 COMPUTER = "computer"

@@ -15,8 +15,8 @@ from meshctl.diagnostics import Diagnostic, Position
 from meshctl.inventory import codes
 from meshctl.inventory.compose import printable
 from meshctl.inventory.documents import InventoryDocument, SecretDocument
-from meshctl.inventory.suggest import did_you_mean, nearest
 from meshctl.inventory.tree import MappingNode, Scalar, Tree, child, describe, key_position, plain_data, position
+from meshctl.suggest import did_you_mean, nearest
 
 _REFERENCE = "a reference: {env: NAME}, {file: PATH, key: NAME} or {age: PATH, key: NAME}"
 # Values of these keys may be secrets in place of references; messages never repeat them.

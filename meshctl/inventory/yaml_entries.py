@@ -14,8 +14,8 @@ from meshctl.diagnostics import Diagnostic, InvalidInput, Position
 from meshctl.inventory import codes
 from meshctl.inventory.compose import compose
 from meshctl.inventory.source import Source, read_source
-from meshctl.inventory.suggest import did_you_mean
 from meshctl.inventory.tree import MappingNode, Scalar, SequenceNode, Tree, describe, position
+from meshctl.suggest import did_you_mean
 
 
 class YamlEntry:

@@ -12,7 +12,6 @@ from dataclasses import dataclass, field
 
 from meshctl.archive import TarMember, tar_of
 from meshctl.errors import InputError
-from meshctl.inventory.suggest import did_you_mean
 from meshctl.model import Fleet, Secret, SecretRef
 from meshctl.model.computers import ROS_1, ROS_2, ROS_TOO_OLD
 from meshctl.render.bridge import BRIDGE_CONFIG_NAME, bridge_config
@@ -29,6 +28,7 @@ from meshctl.robots.collector_release import (
 from meshctl.robots.collector_release import CONFIG_NAME as COLLECTOR_CONFIG_NAME
 from meshctl.robots.scripts import shipped
 from meshctl.robots.wheels import Wheel
+from meshctl.suggest import did_you_mean
 
 UNIT_NAME = "udp-mesh.service"
 BRIDGE_UNIT_NAME = "udp-mesh-ros1.service"

@@ -17,12 +17,12 @@ from meshctl.device.trust import AcceptAnyKey, HostKey, HostKeyPolicy
 from meshctl.errors import InputError, NodeError, Unreachable
 from meshctl.inventory.file_paths import file_path
 from meshctl.inventory.selection import robot_attributes, select
-from meshctl.inventory.suggest import did_you_mean
 from meshctl.model import Fleet, Secret
 from meshctl.nodes.connections import ConnectionPool
 from meshctl.nodes.site_gateways import local_user
 from meshctl.robots.host import Host, SshHost, become_root
 from meshctl.robots.preconditions import computer_of
+from meshctl.suggest import did_you_mean
 
 
 def _no_password() -> Secret | None:

@@ -12,10 +12,10 @@ from enum import Enum
 
 from meshctl.errors import InputError
 from meshctl.inventory.selection import COMPUTER, LIST_HINT, attributes_of, robot_attributes, select, unmanaged_states
-from meshctl.inventory.suggest import did_you_mean
 from meshctl.model import Fleet, NodeState, Role
 from meshctl.status.alarm_codes import CODES
 from meshctl.status.values import Alarm, FleetStatus, Level
+from meshctl.suggest import did_you_mean
 
 ROLES = (*(role.value for role in Role), COMPUTER)
 STATES = tuple(state.value for state in NodeState if state.is_managed)

@@ -6,12 +6,12 @@ import re
 from collections.abc import Iterator
 
 from meshctl.diagnostics import Severity
-from meshctl.inventory.suggest import suggestion
 from meshctl.lint.context import LintContext
 from meshctl.lint.grouping import group_by_key
 from meshctl.lint.openwrt_names import chip_driver, one_edit_apart, similar_radio_paths
 from meshctl.lint.rule import Finding, fleet_rule
 from meshctl.model import Band, Fleet, HardwareProfile, MeshMode, Node, RadioHardware, Release
+from meshctl.suggest import suggestion
 from meshctl.wording import join_limited
 
 # modes that no firmware of the driver supports (docs/facts/openwrt-facts.md, section 6)

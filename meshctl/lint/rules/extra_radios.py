@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from meshctl.diagnostics import Severity
-from meshctl.inventory.suggest import suggestion
 from meshctl.lint.context import LintContext
 from meshctl.lint.openwrt_names import one_edit_apart
 from meshctl.lint.rule import Finding, fleet_rule
 from meshctl.lint.rules.rendering import extra_entries, with_extra
 from meshctl.model import Fleet
 from meshctl.regdb import initiating_channels
+from meshctl.suggest import suggestion
 
 # the options of wireless that inventories set; others are compared with these only
 _OPTIONS = {

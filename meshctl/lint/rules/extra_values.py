@@ -7,12 +7,12 @@ from collections.abc import Callable, Iterator
 from ipaddress import IPv4Network, IPv6Network, ip_interface
 
 from meshctl.diagnostics import Severity
-from meshctl.inventory.suggest import did_you_mean, suggestion
 from meshctl.lint.context import LintContext
 from meshctl.lint.openwrt_names import one_edit_apart
 from meshctl.lint.rule import Finding, fleet_rule
 from meshctl.lint.rules.rendering import extra_entries, with_extra
 from meshctl.model import Fleet
+from meshctl.suggest import did_you_mean, suggestion
 
 # what is wrong with a value: what was expected, and a hint; None if nothing is
 _Check = Callable[[str], tuple[str, str] | None]

@@ -8,7 +8,6 @@ from pathlib import PurePath
 
 from meshctl import firmware
 from meshctl.diagnostics import Severity
-from meshctl.inventory.suggest import nearest, suggestion
 from meshctl.lint.context import LintContext
 from meshctl.lint.openwrt_names import SUBTARGETS, SUCCESSORS, TARGETS, chip_target, suggest_packages
 from meshctl.lint.rule import Example, Finding, fleet_rule
@@ -17,6 +16,7 @@ from meshctl.lint.rules.firmware import ROCKET_IMAGE
 from meshctl.lint.rules.references import suggest
 from meshctl.model import Fleet, Release
 from meshctl.resolve import package_files, package_needs
+from meshctl.suggest import nearest, suggestion
 from meshctl.wording import one_of
 
 # no security fixes (openwrt.org/docs/guide-developer/security)

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 
 from meshctl.diagnostics import Severity
-from meshctl.inventory.suggest import did_you_mean
 from meshctl.lint.context import LintContext
 from meshctl.lint.grouping import group_by_key
 from meshctl.lint.rule import Finding, fleet_rule
 from meshctl.model import Fleet, Role
+from meshctl.suggest import did_you_mean
 from meshctl.wording import join_limited
 
 # A fleet may have as many wrong names as nodes: comparing each of them with all names takes too long.

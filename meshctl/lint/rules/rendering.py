@@ -8,7 +8,6 @@ from typing import NamedTuple
 from meshctl import uci
 from meshctl.diagnostics import Diagnostic, InvalidInput, Severity
 from meshctl.file_access import located
-from meshctl.inventory.suggest import did_you_mean, suggestion
 from meshctl.lint.context import LintContext
 from meshctl.lint.openwrt_names import one_edit_apart
 from meshctl.lint.rule import Example, Finding, fleet_rule
@@ -19,6 +18,7 @@ from meshctl.render.extra import EXTRA
 from meshctl.render.template_files import NO_TEMPLATE, NOT_UCI, TEMPLATE
 from meshctl.resolve import resolve
 from meshctl.resolve.intent import BACKBONE, LAN
+from meshctl.suggest import did_you_mean, suggestion
 from meshctl.wording import join_limited
 
 # a path in the inventory can be very long

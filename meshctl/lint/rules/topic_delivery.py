@@ -6,13 +6,13 @@ import re
 from collections.abc import Iterator
 
 from meshctl.diagnostics import Severity
-from meshctl.inventory.suggest import nearest, suggestion
 from meshctl.lint.context import LintContext
 from meshctl.lint.openwrt_names import one_edit_apart
 from meshctl.lint.ros_types import MESSAGES
 from meshctl.lint.rule import Finding, fleet_rule
 from meshctl.model import Fleet, Outbox, Topic, TopicClass
 from meshctl.resolve import has_routed_lans
+from meshctl.suggest import nearest, suggestion
 from meshctl.wording import counted
 
 _ALL = "all"

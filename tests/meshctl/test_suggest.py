@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from meshctl.inventory.suggest import did_you_mean
 from meshctl.lint.openwrt_names import suggest_packages
+from meshctl.suggest import did_you_mean
 
 
 @pytest.mark.parametrize(
