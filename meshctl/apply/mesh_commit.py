@@ -257,7 +257,7 @@ def _decide(commit: _MeshCommit, needed: Mapping[str, int]) -> dict[str, Outcome
         return _confirm_all(commit)
     if commit.run.interrupt.leaving:
         why = "interrupted before enough nodes passed their checks"
-    unproven = [unmet_of(participant) for participant in commit.participants if not participant.is_proven]
+    unproven = [cause_of(each) or unmet_of(each) for each in commit.participants if not each.is_proven]
     commit.run.note(f"{why}; rolling back: {'; '.join(unproven)}")
     return _roll_back(commit, why)
 

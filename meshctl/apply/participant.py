@@ -95,6 +95,8 @@ def entries_lost(lost: Sequence[Participant], entries: Sequence[str]) -> str:
     named = "the base" if len(entries) == 1 else ", ".join(participant.name for participant in lost)
     if any(participant.is_unreachable for participant in lost):
         return f"{named} did not come back"
+    if any(cause_of(participant) for participant in lost):
+        return f"{named} rolled back"
     return f"{named} did not pass {'its' if len(lost) == 1 else 'their'} checks"
 
 

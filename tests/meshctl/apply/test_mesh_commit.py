@@ -16,7 +16,7 @@ from meshctl.apply.change_in_progress import ChangeInProgress
 from meshctl.apply.context import NodeContext, RunContext
 from meshctl.apply.mesh_commit import _MeshCommit, commit_mesh
 from meshctl.apply.next_action import Action
-from meshctl.apply.participant import Participant, canceled_because, entries_lost, quorum_of, short_of_quorum
+from meshctl.apply.participant import Participant, canceled_because, cause_of, entries_lost, quorum_of, short_of_quorum
 from meshctl.device.errors import NodeRefused
 from meshctl.device.observation import ChangeStatus, Observation
 from meshctl.device.openwrt import UptimeSample
@@ -295,3 +295,12 @@ def test_a_node_of_a_mesh_that_was_rolled_back_names_its_own_cause(
         ended = mesh_commit._roll_back(commit, "the base did not come back")
     why = f"the whole mesh was rolled back: the base did not come back; {expected}"
     assert ended == {"b01": Outcome("b01", Result.ROLLED_BACK, why)}
+
+
+def test_an_entry_node_that_a_power_cut_has_rolled_back_is_not_said_to_have_failed_its_checks() -> None:
+    """Seen on real OpenWrt: the base's power was cut as the switch began, and it answered again before the decision."""
+    status = ChangeStatus("idle", last_id="c1", last_outcome="restored", last_reason="boot")
+    change = cast("ChangeInProgress", SimpleNamespace(id="c1", status=status, unmet=(), last_error="refused"))
+    base = Participant(cast("NodeContext", SimpleNamespace(name="base")), change=change, has_failed=True)
+    assert entries_lost([base], ["base"]) == "the base rolled back"
+    assert cause_of(base) == "base: its power was cut, or it rebooted, before it was confirmed"
