@@ -83,3 +83,11 @@ def test_an_outage_proves_no_loss() -> None:
     sent.add(2, Packet(SNAPSHOT, message(1), 0))
     sent.abandon_all()
     assert sent.confirm_timed_out(9, 0) == 0
+
+
+def test_an_urgent_packet_that_overtakes_a_whole_run_of_others_shows_no_loss() -> None:
+    sent = in_flight(5)
+    sent.add(5, Packet(SNAPSHOT._replace(urgent=True), message(1), 0))
+    acknowledged, lost, _ = sent.acknowledge(5, 1)
+    assert (len(acknowledged), lost) == (1, [])
+    assert sent.outstanding == 5
