@@ -128,6 +128,8 @@ def _verdicts(rig: Rig, struck: Mapping[str, tuple[str, str]], new: str) -> dict
 def _afterwards(
     rig: Rig, struck: Mapping[str, tuple[str, str]], run: Ended, *, old: str, new: str, verb: str
 ) -> list[Case]:
+    if run.code != -signal.SIGKILL and not run.results:
+        raise AssertionError(f"the run ended with {run.code} before it began: {run.err}")
     rig.wait_all_up()
     verdicts = _verdicts(rig, struck, new)
     states = {name: rig.state_of(name, old, new) for name in struck}
