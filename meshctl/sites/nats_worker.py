@@ -366,4 +366,6 @@ class _Complaint:
 
 
 def _log(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)  # noqa: T201
+    # one write: several threads log, and print writes the end of the line apart
+    sys.stderr.write(f"{text}\n")
+    sys.stderr.flush()

@@ -6,8 +6,9 @@ import json
 import os
 import subprocess
 import sys
+import urllib.request
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import closing, suppress
 from pathlib import Path
 
 import pytest
@@ -22,7 +23,9 @@ from meshctl.sites.nats_uplink import NatsUplink
 from meshctl.sites.runs import SiteDirectory
 from meshctl.sites.subjects import SiteSubjects, stream_settings
 from tests.meshctl.device.servers import keypair, public
+from tests.meshctl.monitor.prometheus_program import free_tcp_port
 from tests.meshctl.sites.nats_servers import NatsServerProcess
+from tests.waiting import until
 
 pytestmark = [pytest.mark.xdist_group("nats"), pytest.mark.timeout(120)]
 _NORTH = SiteSubjects("mines", "north")
@@ -69,18 +72,37 @@ def test_a_worker_that_its_leaf_node_no_longer_accepts_ends(tmp_path: Path) -> N
     environ = {**os.environ, "XDG_STATE_HOME": str(tmp_path)}
     site = SiteDirectory.of("mines/north", environ)
     site.install([public(keypair(tmp_path / "operator")).read_text().strip()])
-    leaf = NatsServerProcess(tmp_path / "leaf", "leaf", "north", {})
+    port = free_tcp_port()
+    leaf = NatsServerProcess(tmp_path / "leaf", "leaf", "north", {"http": f"127.0.0.1:{port}"})
+    accepting = leaf.config.read_text()
+    refusing = json.dumps({**json.loads(accepting), "authorization": {"user": "a", "password": "b"}})
     command = [sys.executable, "-m", "meshctl", "worker", "mines/north", "--nats", leaf.url]
-    try:
-        with subprocess.Popen(command, env=environ, stderr=subprocess.PIPE, text=True) as worker:
+    with subprocess.Popen(command, env=environ, stderr=subprocess.PIPE, text=True) as worker:
+
+        def is_ended() -> bool:
+            until(lambda: _connections(port) == 1, "the worker's connection")
+            leaf.reload(refusing)
+            with suppress(subprocess.TimeoutExpired):
+                return worker.wait(5) is not None
+            # what it was sending at that moment broke the connection before the reason was read: it makes another one,
+            # as after a restart of the server
+            leaf.reload(accepting)
+            return False
+
+        try:
             assert worker.stderr is not None
-            assert worker.stderr.readline() == "serving mines/north\n"
-            config = json.loads(leaf.config.read_text())
-            leaf.reload(json.dumps({**config, "authorization": {"user": "a", "password": "b"}}))
-            assert worker.wait(60) == ExitCode.UNREACHABLE
+            assert "serving mines/north\n" in iter(worker.stderr.readline, "")
+            until(is_ended, "the worker's end")
+            assert worker.returncode == ExitCode.UNREACHABLE
             assert "error: the leaf node closed the connection: nats: authorization failed" in worker.stderr.read()
-    finally:
-        leaf.stop()
+        finally:
+            worker.kill()
+            leaf.stop()
+
+
+def _connections(port: int) -> int:
+    with urllib.request.urlopen(f"http://127.0.0.1:{port}/connz", timeout=10) as answer:
+        return int(json.load(answer)["num_connections"])
 
 
 def test_a_stream_that_may_not_be_made_is_named(hub: NatsServerProcess) -> None:

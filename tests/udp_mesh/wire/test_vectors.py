@@ -107,7 +107,7 @@ def test_published_relay_datagrams_open_under_the_hop_key_and_the_carried_one_at
         assert (number, frame.hex()) == (vector["packet_number"], vector["frame"])
         opened[title] = decode_relay(frame)
     assert opened["hello"] == RELAY_FRAMES["hello of a relay"]
-    assert opened["acknowledgment"] == HopAck(0, 8000)
+    assert opened["acknowledgement"] == HopAck(0, 8000)
     carry = opened["carried datagram"]
     assert isinstance(carry, Carry)
     assert (carry.origin, carry.destination) == (ALICE[:8], BOB[:8])
