@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import functools
 import os
 import resource
@@ -39,6 +38,7 @@ from meshctl.render.template_files import (
     template_files,
 )
 from meshctl.resources import shipped
+from meshctl.suggest import did_you_mean
 
 
 class TemplateSet:
@@ -118,8 +118,7 @@ class _Missing(StrictUndefined):
         if self._undefined_hint or value is missing or isinstance(value, Mapping):
             return super()._undefined_message
         known = [known for known in dir(value) if not known.startswith("_")]
-        near = difflib.get_close_matches(str(name), known, 1)
-        instead = f"did you mean {near[0]!r}?" if near else f"it has {', '.join(known)}"
+        instead = did_you_mean(str(name), known) or f"it has {', '.join(known)}"
         return f"{type(value).__name__} has no {name!r}; {instead}"
 
 
