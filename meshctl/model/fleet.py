@@ -327,14 +327,15 @@ class Fleet:
         found = (by_site.get(self.nodes[name].site, self.base_node) for name in names if name in self.nodes)
         return {base.name: base for base in found if base is not None}
 
-    def moving_with(self, name: str) -> frozenset[str]:
-        """What moves with a carried node: the radios of its robot, and all else that this robot carries."""
-        carriers = [robot for robot in self.robots.values() if name in robot.carries]
-        rack = {other for robot in carriers for other in robot.carries if self._is_carried(other)}
-        return frozenset(rack.union(*(robot.nodes for robot in carriers))) if self._is_carried(name) else frozenset()
+    def rack(self, robot: str) -> frozenset[str]:
+        """The nodes on board of a robot: those that it carries, without the deployed ones."""
+        carried = (self.nodes[name] for name in self.robots[robot].carries if name in self.nodes)
+        return frozenset(node.name for node in carried if node.state is NodeState.CARRIED)
 
-    def _is_carried(self, name: str) -> bool:
-        return name in self.nodes and self.nodes[name].state is NodeState.CARRIED
+    def moving_with(self, name: str) -> frozenset[str]:
+        """The nodes that move with a carried one: the radios of its robot, and that robot's rack. Empty for others."""
+        carriers = (robot for robot in self.robots.values() if name in robot.carries and name in self.rack(robot.name))
+        return frozenset(other for robot in carriers for other in (*robot.nodes, *self.rack(robot.name)))
 
     def managed(self) -> Iterator[Node]:
         """The nodes that are neither lost nor retired, in order."""

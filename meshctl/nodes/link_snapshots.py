@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 
 from meshctl.device.link_table import LinkTable, read_links
 from meshctl.errors import MeshctlError
-from meshctl.model import Fleet, Node, NodeState
+from meshctl.model import Fleet, Node
 from meshctl.nodes.connections import ConnectionPool
 from meshctl.placement.margin import (
     RACK_DBM,
@@ -271,15 +271,14 @@ class LinkPoller:
 
 def carried_beacons(fleet: Fleet, robot: str) -> int | None:
     """How many beacons the robot still carries according to the inventory; None if it carries none there at all."""
-    carried = [fleet.nodes[name] for name in fleet.robots[robot].carries if name in fleet.nodes]
-    return sum(node.state is NodeState.CARRIED for node in carried) if carried else None
+    lists_any = any(name in fleet.nodes for name in fleet.robots[robot].carries)
+    return len(fleet.rack(robot)) if lists_any else None
 
 
 def rack_of(fleet: Fleet, robot: str) -> frozenset[str]:
     """What the robot, or the robot of this node, carries according to the inventory."""
     name = robot if robot in fleet.robots else fleet.nodes[robot].robot if robot in fleet.nodes else ""
-    carries = fleet.robots[name].carries if name in fleet.robots else ()
-    return frozenset(name for name in carries if name in fleet.nodes and fleet.nodes[name].state is NodeState.CARRIED)
+    return fleet.rack(name) if name in fleet.robots else frozenset()
 
 
 def own_radios(fleet: Fleet, robot: str) -> tuple[Node, ...]:

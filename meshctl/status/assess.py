@@ -88,6 +88,8 @@ def assess(snapshot: Snapshot, nodes: Iterable[Node], now: float, robots: Iterab
             statuses.append(_unreachable_status(snapshot, node, sightings.get(node.name, ()), now))
             continue
         last = snapshot.known.get(node.name)
+        # the robot that carries a beacon, and its rack, may use it as a relay while it is on board
+        moving_with = snapshot.fleet.moving_with(node.name) | {node.name}
         everything = NodeAlarmInput(
             fleet=snapshot.fleet,
             node=node,
@@ -103,12 +105,7 @@ def assess(snapshot: Snapshot, nodes: Iterable[Node], now: float, robots: Iterab
             path=paths.get(node.name),
             is_path_known=entry_by_site.get(node.site, snapshot.entry) in paths,
             cuts_off=cut_off_by.get(node.name, ()),
-            # the robot that carries a beacon, and its rack, may use it as a relay while it is on board
-            relays=tuple(
-                name
-                for name in relays.get(node.name, ())
-                if name != node.name and name not in snapshot.fleet.moving_with(node.name)
-            ),
+            relays=tuple(name for name in relays.get(node.name, ()) if name not in moving_with),
             seconds_since_last_known=None if last is None else max(0.0, observation.answered_at_s - last.seen_s),
             own_lock=snapshot.own_lock,
         )
