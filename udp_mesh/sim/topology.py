@@ -69,6 +69,8 @@ class Topology:
         self.on_event: Callable[[str, Event, float], None] | None = None
         self.rng = random.Random(seed)
         self.clocks: dict[str, float] = {}
+        self.timers_late_s = 0.0
+        """The timers of busy computers come up to this late."""
         self._busy_until: dict[tuple[str, str], float] = {}
         self._wakes_at: dict[str, float] = {}
 
@@ -177,7 +179,10 @@ class Topology:
         if at is not None:
             at -= self.clocks.get(name, 0.0)
         if at is not None and max(at, self.now) < self._wakes_at[name]:
-            self._wakes_at[name] = at = max(at, self.now + _MIN_STEP_S)
+            at = max(at, self.now + _MIN_STEP_S)
+            if self.timers_late_s:
+                at = min(self._wakes_at[name], at + self.rng.random() * self.timers_late_s)
+            self._wakes_at[name] = at
             self.event_queue.at(at, lambda: self._wake(name, node, at))
 
     def _wake(self, name: str, node: Endpoint, at: float) -> None:

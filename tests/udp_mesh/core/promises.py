@@ -7,6 +7,7 @@ Messages and changes for some seconds, then everything is repaired. Throughout a
 - what is ready to be sent has a timer, no less urgent level is served first, and packets have the numbers that
   acknowledgements mean;
 - a datagram takes effect once, and not long after it was sent (`taken_once`);
+- no timer of a node stays in the past, also where timers come late;
 - nothing is left over, and an idle team is quiet.
 """
 

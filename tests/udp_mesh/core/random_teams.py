@@ -55,6 +55,7 @@ CHANGES = (
     *("down", "loss", "one-way", "jitter", "path-mtu", "link-mtu", "rate"),
     *("kill", "leave", "suspend", "disk", "read", "wants", "apply", "keys", "unplug"),
 )
+MAX_PAST_TIMERS = 3
 SMALL, LARGE = (20, 100, 100, 300, 1_380, 1_400), (1_420, 9_000, 60_000, 200_000)
 
 
@@ -127,7 +128,10 @@ class RandomTeam(Topology):
         self.suspended: dict[str, Endpoint] = {}
         self.datagrams: Counter[str] = Counter()
         self.serial = 0
+        self.timers_late_s = (0.0, 0.001, 0.05)[seed % 3]
         self._starting: list[tuple[str, Event]] | None = None
+        self._past_timers: Counter[str] = Counter()
+        """By node: how often in a row its next timer was in the past after it did what was due."""
         self.on_event = self._on_event
         self.on_datagram = self._on_datagram
         self._build()
@@ -194,6 +198,19 @@ class RandomTeam(Topology):
     def _restored_from(self, node: Endpoint, kept: list[StoredMessage]) -> int:
         """The id of the first message that came from the disk: they have the last ids so far."""
         return node._state.next_message_id - len(kept)
+
+    def _wake(self, name: str, node: Endpoint, at: float) -> None:
+        if self.nodes.get(name) is not node or self._wakes_at[name] != at:
+            return
+        super()._wake(name, node, at)
+        due = node.next_timer()
+        # Compression and the like are due at once until they are done.
+        if due is None or due == float("-inf") or due > self.clock(name):
+            self._past_timers[name] = 0
+            return
+        self._past_timers[name] += 1
+        if self._past_timers[name] > MAX_PAST_TIMERS:
+            raise Broken(f"{name} runs in circles: its next timer stays {self.clock(name) - due:.6f} s in the past")
 
     def kill(self, name: str, *, politely: bool = False) -> None:
         """End a run. What it had neither ended nor on disk has no outcome."""

@@ -64,6 +64,9 @@ class OldRobot:
         out: list[Datagram] = []
         while datagrams := self.node.datagrams_to_send(self.now):
             out.extend(datagrams)
+        due = self.node.next_timer()
+        assert due is not None
+        assert due > self.now, "what is due was done, but the next timer is still in the past"
         return [decode_legacy(datagram.data) for datagram in out if datagram.destination == OLD]
 
     def hear_payloads(self) -> list[LegacyPayload]:

@@ -3,6 +3,8 @@
 import heapq
 import random
 
+import pytest
+
 from tests.udp_mesh.core.legacy_program import LegacyProgram
 from tests.udp_mesh.core.test_legacy import OldRobot, fragments
 from udp_mesh.core.events import Event, MessagePeerLost, PeerOffline
@@ -91,6 +93,24 @@ def test_after_a_loss_acknowledgements_are_repeated_once_more_for_ten_seconds() 
     assert acknowledgements(fragments(6, b"x")[0]) == 3
     old.now += 3.0
     assert acknowledgements(fragments(7, b"x")[0]) == 2
+
+
+@pytest.mark.parametrize("late_s", [0.001, 0.02, 0.049, 0.3, 30.0])
+def test_a_timer_that_comes_late_is_not_due_again_at_once(late_s: float) -> None:
+    """On a busy computer the last prediction after a message may come after the time for which there are any: the timer
+    stayed in the past, and the daemon ran in circles until the next message."""
+    for shift in range(50):
+        old = OldRobot()
+        old.say(fragments(5, b"x")[0])
+        old.now += 0.001 * shift
+        old.say(fragments(6, b"x")[0])
+        end = old.now + 3.0
+        while old.now < end:
+            # Checks that the next timer is later.
+            old.hear()
+            due = old.node.next_timer()
+            assert due is not None
+            old.now = due + late_s
 
 
 def test_what_waits_for_a_legacy_robot_that_is_lost_ends() -> None:

@@ -160,7 +160,9 @@ class LegacyAcks:
             acks.append(ack)
             if again and now < self._lossy_until:
                 self._schedule(at + REPEAT_LOSSY_S, ack, again=False)
-        if self._predicts(now) and now >= self._predicted_at + PREDICT_INTERVAL_S:
+        # Judged by the time they were due, as in `next_at`: a late call must not leave that timer in the past.
+        predict_at = self._predicted_at + PREDICT_INTERVAL_S
+        if now >= predict_at and self._predicts(predict_at):
             self._predicted_at = now
             if self._restored:
                 acks += self._predicted(self._restored_step * RESTORED_STEP, RESTORED_STEP)
@@ -169,9 +171,9 @@ class LegacyAcks:
                 acks += self._predicted()
         return acks
 
-    def _predicts(self, now: float) -> bool:
-        """Whether predicted acknowledgments are sent without a heartbeat."""
-        return self._restored_step < RESTORED_STEPS if self._restored else now < self._payload_at + PREDICT_FOR_S
+    def _predicts(self, at: float) -> bool:
+        """Whether predicted acknowledgments are sent at this time without a heartbeat."""
+        return self._restored_step < RESTORED_STEPS if self._restored else at < self._payload_at + PREDICT_FOR_S
 
     def next_at(self) -> float:
         at = self._repeats[0][0] if self._repeats else float("inf")
