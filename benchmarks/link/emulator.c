@@ -16,7 +16,7 @@
  * Control: one datagram per command on the Unix socket SOCKET; the answer goes to the sender's bound address.
  *   set key=value ...   rate (bit/s) delay_ms loss burst_enter burst_leave burst_loss queue overhead_us attempts half up
  *   groups N N ...      the group of each port
- *   count               the counters as JSON
+ *   count               the counters as JSON, and how many frames are on their way
  *   reset               counters to zero
  *   quit
  */
@@ -366,7 +366,10 @@ static void set_groups(char *numbers)
 
 static void count(void)
 {
-    say("{\"airtime_ns\":%llu,\"ports\":[", (unsigned long long)airtime_ns);
+    int in_flight = (int)heap_size;
+    for (int i = 0; i < port_count; i++)
+        in_flight += ports[i].waiting;
+    say("{\"airtime_ns\":%llu,\"in_flight\":%d,\"ports\":[", (unsigned long long)airtime_ns, in_flight);
     for (int i = 0; i < port_count; i++) {
         struct port *port = &ports[i];
         say("%s{\"in_frames\":%llu,\"in_bytes\":%llu,\"queue_drops\":%llu,\"losses\":%llu,\"down_drops\":%llu,"

@@ -14,6 +14,7 @@ import shutil
 import socket
 import subprocess
 import tempfile
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -25,9 +26,11 @@ INTERFACE = "mesh0"
 # a healthy emulator is ready within milliseconds; a busy machine may need longer
 READY_TIMEOUT_S = 30.0
 ANSWER_TIMEOUT_S = 10.0
+# a frame of the EtherType for local experiments, which nothing answers
 _TEACH = """import socket, sys
-with socket.socket(type=socket.SOCK_DGRAM) as teacher:
-    teacher.sendto(b"x", (sys.argv[1], 9))
+with socket.socket(socket.AF_PACKET, socket.SOCK_RAW) as teacher:
+    teacher.bind((sys.argv[1], 0))
+    teacher.send(bytes.fromhex("ffffffffffff") + teacher.getsockname()[4] + bytes.fromhex("88b5") + bytes(46))
 """
 
 
@@ -68,9 +71,10 @@ class PortCount:
 
 @dataclass(frozen=True, slots=True)
 class Count:
-    """`airtime_s` is the time the transmitters were busy, retries included."""
+    """`airtime_s` is the time the transmitters were busy, retries included; `in_flight` are frames on their way."""
 
     airtime_s: float
+    in_flight: int
     ports: tuple[PortCount, ...]
 
 
@@ -146,9 +150,19 @@ class Laboratory:
                 if there != here:
                     _ip("-n", namespace, "neigh", "replace", address, "lladdr", macs[there], "dev", INTERFACE,
                         "nud", "permanent")  # fmt: skip
-        # one datagram from each host teaches the emulator the port of every address
+        self._teach()
+
+    def _teach(self) -> None:
+        """One frame from each host teaches the emulator the port of every address. When this returns, they are counted
+        and gone."""
         for here, _ in enumerate(self.namespaces):
-            self.run(here, ["python3", "-c", _TEACH, self.addresses[(here + 1) % len(self.addresses)]])
+            self.run(here, ["python3", "-c", _TEACH, INTERFACE])
+        end = time.monotonic() + READY_TIMEOUT_S
+        while (counted := self.count()).in_flight or not all(port.in_frames for port in counted.ports):
+            if time.monotonic() > end:
+                raise LaboratoryError(f"the emulator has not learned all ports: {counted}")
+            time.sleep(0.001)
+        self.reset()
 
     def set(self, **settings: float) -> None:
         """Change the link now; names and units as in `Link`."""
@@ -172,7 +186,8 @@ class Laboratory:
 
     def count(self) -> Count:
         answer = json.loads(self._ask("count"))
-        return Count(answer["airtime_ns"] / 1e9, tuple(PortCount(**port) for port in answer["ports"]))
+        ports = tuple(PortCount(**port) for port in answer["ports"])
+        return Count(answer["airtime_ns"] / 1e9, answer["in_flight"], ports)
 
     def reset(self) -> None:
         self._ask("reset")
@@ -216,6 +231,9 @@ class Wire(Laboratory):
         here, there = self.namespaces
         _ip("link", "add", INTERFACE, "netns", here, "type", "veth", "peer", "name", INTERFACE, "netns", there)
 
+    def _teach(self) -> None:
+        """Not needed: there is no emulator."""
+
     def set(self, **settings: float) -> None:
         """Not supported: a veth pair has no parameters."""
 
@@ -224,7 +242,7 @@ class Wire(Laboratory):
 
     def count(self) -> Count:
         nothing = PortCount(0, 0, 0, 0, 0, 0, 0, 0)
-        return Count(0.0, (nothing, nothing))
+        return Count(0.0, 0, (nothing, nothing))
 
     def reset(self) -> None:
         """Not supported: a veth pair has no counters."""

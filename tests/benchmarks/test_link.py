@@ -41,8 +41,8 @@ def send(lab: Laboratory, count: int) -> None:
 def settled(lab: Laboratory, count: int) -> None:
     """Wait until the link has handled every frame."""
     for _ in range(3000):
-        port, other = lab.count().ports
-        if port.queue_drops + port.losses + port.down_drops + other.out_frames >= count:
+        counted = lab.count()
+        if counted.ports[0].in_frames >= count and not counted.in_flight:
             return
         time.sleep(0.01)
     raise AssertionError(f"{count} frames were sent, the link counted {lab.count()}")
@@ -54,9 +54,9 @@ def test_a_clean_link_carries_every_frame_and_its_airtime_is_bytes_over_rate(lab
     send(lab, 200)
     settled(lab, 200)
     count = lab.count()
-    # the receiver's replies to the learning datagram may still be in flight
-    assert 200 <= count.ports[1].out_frames <= 202
-    assert count.ports[1].out_bytes == pytest.approx(200 * 1028, rel=0.01)
+    assert count.ports[1].out_frames == 200
+    assert count.ports[1].out_bytes == 200 * 1028
+    # with that of the receiver's replies, port unreachable, whose number the kernel limits
     assert count.airtime_s == pytest.approx(200 * 1028 * 8 / 1e9, rel=0.02)
 
 
@@ -104,5 +104,4 @@ def test_hosts_out_of_reach_of_each_other_lose_every_frame(lab: Laboratory) -> N
         settled(lab, 50)
         sender, receiver = lab.count().ports
         assert sender.down_drops == dropped
-        # and the receiver's replies
-        assert delivered <= receiver.out_frames <= delivered + 2
+        assert receiver.out_frames == delivered
