@@ -45,9 +45,10 @@ def worker(
 
 def _serve_nats(site: str, url: str, hub: str) -> None:
     from meshctl.sites.nats_client import NatsClient, NatsServer
-    from meshctl.sites.nats_worker import NatsWorker
+    from meshctl.sites.nats_worker import Complaint, NatsWorker
     from meshctl.sites.runs import SiteDirectory
 
     directory = SiteDirectory.of(site, os.environ)
     server = NatsServer(url, name=f"meshctl worker {site}")
-    NatsWorker(directory, os.environ, NatsClient(server, waits_at_start=True), hub).serve()
+    complaint = Complaint(f"waiting for the leaf node {url}: ", "connected to the leaf node")
+    NatsWorker(directory, os.environ, NatsClient(server, note=complaint), hub).serve()

@@ -48,16 +48,17 @@ class NatsServer:
 
 class NatsClient:
     """`close` ends it. A connection that is lost is made again in the background; meanwhile everything is `NatsLost`.
-    The first one is `NatsLost`, too, if it fails; with `waits_at_start` it is tried until it succeeds."""
+    The first one is `NatsLost`, too, if it fails; with `note` it is tried until it succeeds, and each time `note` gets
+    why it does not, and "" once it does."""
 
-    def __init__(self, server: NatsServer, *, waits_at_start: bool = False) -> None:
+    def __init__(self, server: NatsServer, *, note: Callable[[str], None] | None = None) -> None:
         self._server = server
         self.refusals = Refusals(server.url)
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, name="nats", daemon=True)
         self._thread.start()
         try:
-            self._client: Client = self._run(self._connect(waits_at_start), None if waits_at_start else CONNECT_S * 2)
+            self._client: Client = self._run(self._connect(note), CONNECT_S * 2 if note is None else None)
         except BaseException:
             self._end_loop()
             raise
@@ -68,7 +69,7 @@ class NatsClient:
         self._loop.run_until_complete(_cancel_all())
         self._loop.close()
 
-    async def _connect(self, waits_at_start: bool) -> Client:
+    async def _connect(self, note: Callable[[str], None] | None) -> Client:
         try:
             from nats.aio.client import Client
             from nats.errors import Error
@@ -94,17 +95,21 @@ class NatsClient:
             try:
                 # by itself it would try for ever, and without a word
                 await asyncio.wait_for(client.connect(self._server.url, **options), CONNECT_S)
-                return client
             except ImportError as error:
                 # nats-py needs nkeys for credentials
                 raise not_installed(error) from error
             except (TimeoutError, Error, OSError) as error:
                 with suppress(Error, OSError):
                     await client.close()
-                if not waits_at_start:
-                    text = str(error) or f"no answer within {CONNECT_S:g} s{self.refusals.reason}"
+                text = str(error) or f"no answer within {CONNECT_S:g} s{self.refusals.reason}"
+                if note is None:
                     raise NatsLost(f"NATS server {self._server.url}: {text}", hint=HINT) from error
+                note(text)
                 await asyncio.sleep(_RECONNECT_S)
+            else:
+                if note is not None:
+                    note("")
+                return client
 
     def _run(self, work: Coroutine[Any, Any, _T], timeout_s: float | None = ANSWER_S * 2) -> _T:
         """Run in the event loop, and translate errors."""

@@ -110,7 +110,7 @@ class NatsWorker:
         raise NatsLost(f"the leaf node closed the connection: {reason}")
 
     def _repeat(self, loop: Callable[[], None]) -> None:
-        complaint = _Complaint()
+        complaint = Complaint()
         while True:
             began_s, text = time.monotonic(), ""
             try:
@@ -182,7 +182,7 @@ class NatsWorker:
         assembler = Assembler()
         pieces: dict[str, list[StoredMessage]] = {}
         subjects = self._subjects
-        complaint = _Complaint("no orders from the hub: ", "orders from the hub again")
+        complaint = Complaint("no orders from the hub: ", "orders from the hub again")
         for stored in self.client.work(subjects.order_stream, subjects.orders, self.hub, CONSUMER, complaint):
             pieces.setdefault(stored.chunk.message, []).append(stored)
             whole = assembler.add(stored.chunk)
@@ -351,7 +351,7 @@ class _Replies:
 
 
 @dataclass(slots=True)
-class _Complaint:
+class Complaint:
     """Logs a reason once while it stays the same, which may be for days; an empty one ends it."""
 
     prefix: str = ""

@@ -50,7 +50,7 @@ def serving(directory: Path, url: str, loops: Iterable[str]) -> Iterator[SiteDir
     """A site whose worker runs these of its loops, in threads that end with its connection."""
     site = SiteDirectory.of("mines/north", {"XDG_STATE_HOME": str(directory)})
     site.install([public(keypair(directory / "operator")).read_text().strip()])
-    client = NatsClient(NatsServer(url), waits_at_start=True)
+    client = NatsClient(NatsServer(url), note=lambda reason: None)
     worker = NatsWorker(site, {}, client, "hub")
     is_over = threading.Event()
 

@@ -9,6 +9,7 @@ import sys
 import urllib.request
 from collections.abc import Iterator
 from contextlib import closing, suppress
+from itertools import islice
 from pathlib import Path
 
 import pytest
@@ -98,6 +99,27 @@ def test_a_worker_that_its_leaf_node_no_longer_accepts_ends(tmp_path: Path) -> N
         finally:
             worker.kill()
             leaf.stop()
+
+
+def test_a_worker_that_cannot_connect_yet_says_why(tmp_path: Path) -> None:
+    """Its unit starts with the gateway, often before the leaf node, or with a wrong address."""
+    environ = {**os.environ, "XDG_STATE_HOME": str(tmp_path)}
+    site = SiteDirectory.of("mines/north", environ)
+    site.install([public(keypair(tmp_path / "operator")).read_text().strip()])
+    leaf = NatsServerProcess(tmp_path / "leaf", "leaf", "north", {})
+    leaf.stop()
+    command = [sys.executable, "-m", "meshctl", "worker", "mines/north", "--nats", leaf.url]
+    with subprocess.Popen(command, env=environ, stderr=subprocess.PIPE, text=True) as worker:
+        assert worker.stderr is not None
+        try:
+            lines = [worker.stderr.readline()]
+            leaf.start()
+            lines += islice(worker.stderr, 2)
+        finally:
+            worker.kill()
+            leaf.stop()
+    assert lines[0].startswith(f"waiting for the leaf node {leaf.url}: ")
+    assert lines[1:] == ["connected to the leaf node\n", "serving mines/north\n"]
 
 
 def _connections(port: int) -> int:

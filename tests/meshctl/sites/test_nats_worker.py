@@ -31,7 +31,7 @@ from meshctl.sites.envelope import (
     verified,
 )
 from meshctl.sites.nats_client import NatsClient
-from meshctl.sites.nats_worker import NatsWorker, _Complaint
+from meshctl.sites.nats_worker import Complaint, NatsWorker
 from meshctl.sites.order import ClockBehind, Order, OrderRefused, images_sha256, sign_order
 from meshctl.sites.runs import RunDirectory, SiteDirectory, read_json
 from tests.meshctl.device.servers import keypair, public
@@ -123,7 +123,7 @@ def test_an_order_for_what_was_planned_here_is_not_unpacked_again(site: Site) ->
 
 
 def test_a_reason_that_stays_the_same_is_logged_once(capsys: pytest.CaptureFixture[str]) -> None:
-    complaint = _Complaint("no orders: ", "orders again")
+    complaint = Complaint("no orders: ", "orders again")
     for reason in ("", "no answer", "no answer", "no room", "", "", "no answer"):
         complaint(reason)
     logged = ["no orders: no answer", "no orders: no room", "orders again", "no orders: no answer"]
