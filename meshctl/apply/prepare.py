@@ -19,9 +19,8 @@ from meshctl.errors import InputError
 from meshctl.fleet import Interrupt, Observer, silent
 from meshctl.fleet.journal import Journal, LastKnown
 from meshctl.model import Fleet, Node, NodeState
-from meshctl.model.ip import IpAddress
-from meshctl.nodes.collect import FleetObservation, collect, facts_of, known_macs
-from meshctl.nodes.connections import ConnectionPool
+from meshctl.nodes.collect import FleetObservation, collect, facts_of, known_macs, login_place
+from meshctl.nodes.connections import ConnectionPool, LoginPlace
 from meshctl.nodes.desired import Renderer
 from meshctl.nodes.last_seen import MAX_QUERIED, last_seen_of
 from meshctl.nodes.slots import nodes_in_work
@@ -236,8 +235,8 @@ def _node_plans(
             with_firmware=choices.with_firmware,
             own_keys=None if observation is None else connections.own_keys(want.node),
         )
-        former = connections.former_addresses().get(name)
-        if former is not None and observation is not None and facts_of(observation).get("address") == str(former):
+        former = connections.former_places().get(name)
+        if former is not None and observation is not None and login_place(facts_of(observation)) == former:
             made = replace(made, notes=(_reached_at(renderer.fleet, want.node, former), *made.notes))
         if made.firmware is not None and (faults := images.faults(want.node.hardware)):
             made = made.refused(faults, "correct the image or its hardware profile, or plan with --no-firmware")
@@ -248,11 +247,16 @@ def _node_plans(
     return _NodePlans(plans, desired)
 
 
-def _reached_at(fleet: Fleet, node: Node, former: IpAddress) -> str:
-    """Where a node is that has not yet got its address."""
-    mesh = next((mesh.name for mesh in fleet.meshes.values() if former in mesh.network), "")
-    place = f" in the network of mesh {mesh}" if mesh and mesh not in node.meshes else ""
-    return f"it is reached at {former}{place}, where it was last seen, and gets the address {node.address.ip}"
+def _reached_at(fleet: Fleet, node: Node, former: LoginPlace) -> str:
+    """Where a node is that has not yet got its address or port."""
+    address, port = former
+    mesh = next((mesh.name for mesh in fleet.meshes.values() if address in mesh.network), "")
+    place = f"{address} in the network of mesh {mesh}" if mesh and mesh not in node.meshes else str(address)
+    gets = [] if address == node.address.ip else [f"the address {node.address.ip}"]
+    if port != node.ssh.port:
+        place += f", port {port}"
+        gets.append(f"port {node.ssh.port}")
+    return f"it is reached at {place}, where it was last seen, and gets {' and '.join(gets)}"
 
 
 def _with_fleet_plan(

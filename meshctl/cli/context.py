@@ -108,7 +108,7 @@ def session(
     from meshctl.fleet.process import lock_owner
     from meshctl.inventory import load_fleet
     from meshctl.inventory.secrets import SecretStore
-    from meshctl.nodes.collect import former_addresses
+    from meshctl.nodes.collect import former_places
     from meshctl.nodes.connections import ConnectionPool
     from meshctl.nodes.desired import Renderer
 
@@ -129,7 +129,7 @@ def session(
     ):
         with suppress(MeshctlError) if changes_nothing else nullcontext():
             journal.move_lab_runs(fleet.name, lab_of)
-        access.former_addresses = cache(lambda: former_addresses(fleet, journal.last_known(fleet.name)))
+        access.former_places = cache(lambda: former_places(fleet, journal.last_known(fleet.name)))
         yield Session(
             fleet,
             Renderer.of(fleet, SecretStore(os.environ, Path(fleet.base)).get),

@@ -22,10 +22,10 @@ from meshctl.fleet import Interrupt, Observer, Outcome, Result, run, silent
 from meshctl.fleet.journal import LastKnown
 from meshctl.fleet.process import is_dead
 from meshctl.model import Fleet, Node, NodeState
-from meshctl.model.ip import IpAddress
 from meshctl.nodes.backoff import Backoff
-from meshctl.nodes.connections import ConnectionPool
-from meshctl.plan.observed_files import management_address
+from meshctl.nodes.connections import ConnectionPool, LoginPlace
+from meshctl.plan.lockout import SSH_PORT, listening_ports
+from meshctl.plan.observed_files import management_address, parsed
 from meshctl.topology import Graph, Report, mesh_macs, observed_graph, report_of, with_alternates
 
 # How long a node may take to roll back a change of a dead process: its files, and a reload.
@@ -79,17 +79,26 @@ def known_macs(fleet: Fleet, known: Mapping[str, LastKnown]) -> dict[str, str]:
     return with_alternates(macs)
 
 
-def former_addresses(fleet: Fleet, known: Mapping[str, LastKnown]) -> dict[str, IpAddress]:
-    """The management addresses at which nodes were last seen, where the inventory has another one by now: a node that
-    was off, or that could not be changed, still answers there, on the mesh that it was in."""
+def former_places(fleet: Fleet, known: Mapping[str, LastKnown]) -> dict[str, LoginPlace]:
+    """Where nodes were last seen, if the inventory has another address or port by now: a node that was off, or that has
+    not been changed yet, still answers there, on the mesh that it was in."""
     taken = {own.ip for node in fleet.managed() for own in (node.address, node.lan_address) if own is not None}
     found = {}
     for name, last in known.items():
-        with suppress(ValueError):
-            address = ip_address(last.facts.get("address", ""))
-            if name in fleet.nodes and address not in taken:
-                found[name] = address
+        place, node = login_place(last.facts), fleet.nodes.get(name)
+        if place is None or node is None or place == (node.address.ip, node.ssh.port):
+            continue
+        if place.address == node.address.ip or place.address not in taken:
+            found[name] = place
     return found
+
+
+def login_place(facts: Mapping[str, str]) -> LoginPlace | None:
+    """Where a node with these facts accepts logins; None if they do not say."""
+    try:
+        return LoginPlace(ip_address(facts.get("address", "")), int(facts.get("port", SSH_PORT)))
+    except ValueError:
+        return None
 
 
 def collect(
@@ -160,8 +169,10 @@ def _clear(connection: SshConnection, change: ChangeStatus) -> None:
 def facts_of(observation: Observation) -> dict[str, str]:
     """The facts of a node that the journal stores: how to find it again, and its last known state."""
     address = management_address((observation.uci or {}).get("network"))
+    dropbear = parsed((observation.uci or {}).get("dropbear"), "dropbear")
     facts = {
         "address": "" if address is None else str(address),
+        "port": "" if dropbear is None else next(iter(listening_ports(dropbear)), ""),
         "macs": " ".join(mesh_macs(observation)),
         "boot_id": observation.boot_id or "",
         "uptime_s": "" if observation.uptime_s is None else f"{observation.uptime_s:.0f}",

@@ -12,7 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 from meshctl.device.authentication import own_keys
 from meshctl.device.connection import Credentials, Deadlines, Endpoint, OwnKey
@@ -35,6 +35,13 @@ class Locate(Protocol):
     """The host and port at which a node with this address is reached."""
 
     def __call__(self, node: Node, address: IpAddress) -> tuple[str, int]: ...
+
+
+class LoginPlace(NamedTuple):
+    """Where a node accepts logins."""
+
+    address: IpAddress
+    port: int
 
 
 def as_written(node: Node, address: IpAddress) -> tuple[str, int]:
@@ -62,8 +69,8 @@ class ConnectionPool:
     bench_endpoints: dict[str, Endpoint] = field(default_factory=dict)
     # node -> local interface it was discovered on, tried first for its new address
     interfaces: dict[str, str] = field(default_factory=dict)
-    # node -> the address at which it was last seen, where the inventory has another one by now
-    former_addresses: Callable[[], Mapping[str, IpAddress]] = dict
+    # node -> where it was last seen, if the inventory has another address or port by now
+    former_places: Callable[[], Mapping[str, LoginPlace]] = dict
     meter: TrafficMeter = field(default_factory=TrafficMeter, repr=False)
     # nodes whose device is on a cable of the operator's: not behind the gateway of their site
     on_bench: set[str] = field(default_factory=set)
@@ -117,8 +124,8 @@ class ConnectionPool:
     ) -> SshConnection:
         """A new connection, owned by the caller. Raises what `ssh.connect` raises.
 
-        Without `endpoint`, the node's candidates are tried, then its former address, where only its pinned key is
-        accepted: another device may have that address.
+        Without `endpoint`, the node's candidates are tried, then its former address and port, where only its pinned key
+        is accepted: another device may have that address.
         """
 
         def connect_to(where: Endpoint) -> SshConnection:
@@ -145,12 +152,22 @@ class ConnectionPool:
                 places = tuple(places_left)
                 if not places:
                     is_pinned_only = policy is None and self.policy is None
-                    former = self.former_addresses().get(node.name) if endpoint is None and is_pinned_only else None
+                    former = self._former_endpoint(node) if endpoint is None and is_pinned_only else None
                     if former is not None:
                         with suppress(NodeError):
-                            return connect_to(self.endpoint(node, former))
+                            return connect_to(former)
                     error.hint = self._site_hint(node) or error.hint
                     raise
+
+    def _former_endpoint(self, node: Node) -> Endpoint | None:
+        place = self.former_places().get(node.name)
+        if place is None:
+            return None
+        endpoint = self.endpoint(node, place.address)
+        # elsewhere the port is not the node's own
+        if self.locate is as_written and not node.ssh.host:
+            endpoint = replace(endpoint, port=place.port)
+        return None if endpoint in self.candidates(node) else endpoint
 
     def _site_hint(self, node: Node) -> str:
         """The hint for a node that cannot be reached from here because its site has no login."""

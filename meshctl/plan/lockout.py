@@ -22,6 +22,8 @@ _OFF = frozenset({"0", "off", "false", "no", "disabled"})
 # the values of a rule's `proto` that include TCP
 _TCP = frozenset({"tcp", "6", "tcpudp", "all", "any", "*", "0"})
 AUTHORIZED_KEYS = "etc/dropbear/authorized_keys"
+# dropbear's, where /etc/config/dropbear names none
+SSH_PORT = 22
 
 
 def lockout(node: Node, files: Mapping[str, bytes], own: Sequence[OwnKey]) -> FailedPrecondition | None:
@@ -59,7 +61,7 @@ def server_lockout(node: Node, packages: Mapping[str, Package]) -> FailedPrecond
     if dropbear is None or network is None:
         return None
     steady = {section.name for section in network.of_type("interface") if section.get("proto") == "static"}
-    sections = [section for section in dropbear.of_type("dropbear") if section.get("enable", "1") not in _OFF]
+    sections = _enabled(dropbear)
     options = ("DirectInterface", "Interface")
     missing = [
         [(option, name) for option in options if (name := section.get(option)) and name not in steady]
@@ -69,7 +71,7 @@ def server_lockout(node: Node, packages: Mapping[str, Package]) -> FailedPrecond
         return FailedPrecondition(
             "no login would be possible afterwards: its dropbear is disabled", "remove `enable` from extra_uci"
         )
-    ports = list(dict.fromkeys(port for section in sections for port in section.items("Port") or ("22",)))
+    ports = listening_ports(dropbear)
     if not node.ssh.host and str(node.ssh.port) not in ports:
         return FailedPrecondition(
             f"no login would be possible afterwards: its dropbear would listen on port {', '.join(ports)}, "
@@ -85,6 +87,17 @@ def server_lockout(node: Node, packages: Mapping[str, Package]) -> FailedPrecond
         f"name one of {', '.join(sorted(str(network) for network in steady - {'loopback'})) or 'its networks'}, "
         f"or remove {option} from extra_uci",
     )
+
+
+def listening_ports(dropbear: Package) -> tuple[str, ...]:
+    """The ports of /etc/config/dropbear, in its order; empty if all of its servers are disabled."""
+    return tuple(
+        dict.fromkeys(port for section in _enabled(dropbear) for port in section.items("Port") or (str(SSH_PORT),))
+    )
+
+
+def _enabled(dropbear: Package) -> list[Section]:
+    return [section for section in dropbear.of_type("dropbear") if section.get("enable", "1") not in _OFF]
 
 
 def firewall_notes(node: Node, packages: Mapping[str, Package]) -> tuple[str, ...]:

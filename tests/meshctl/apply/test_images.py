@@ -42,7 +42,7 @@ def test_a_node_whose_image_is_for_another_board_is_refused_by_the_plan(
     renderer = Renderer.of(team, secret)
     rendered = {name: renderer.desired(team.nodes[name]) for name in ("b01", "b02")}
     seen = FleetObservation({name: running(team, name) for name in rendered}, {})
-    pool: Any = SimpleNamespace(own_keys=lambda node: None, former_addresses=dict)
+    pool: Any = SimpleNamespace(own_keys=lambda node: None, former_places=dict)
     plan = assemble(renderer, pool, rendered, seen, {}, salt=SALT, owner="ann", choices=PlanOptions()).plan
     verdict = Verdict.REFUSED if refusal else Verdict.CHANGE
     assert {(made.verdict, made.reason, made.firmware is None) for made in plan.nodes.values()} == {
