@@ -19,7 +19,8 @@ FLOOD_DATAGRAMS = 32
 """Half as many unauthenticated datagrams in one wake-up are a flood; then at most so many are read at a time."""
 PAUSE = 4.0
 """Time without reading after each batch, in multiples of what the batch took: a fifth of the time goes to a flood."""
-MIN_PAUSE_S = 0.002
+MIN_PAUSE_S, MAX_PAUSE_S = 0.002, 0.5
+"""A batch that took longer than the pauses allow was interrupted, for example because the process was suspended."""
 LOG_INTERVAL_S = 60.0
 
 
@@ -72,7 +73,8 @@ class StrangerThrottle:
         self.flooded.add(name)
         now = self._loop.time()
         self._loop.remove_reader(link.strangers_fileno())
-        self._pauses[name] = self._loop.call_at(now + max(MIN_PAUSE_S, PAUSE * (now - began)), self._resume, link)
+        pause_s = min(max(MIN_PAUSE_S, PAUSE * (now - began)), MAX_PAUSE_S)
+        self._pauses[name] = self._loop.call_at(now + pause_s, self._resume, link)
         if now - self._logged_at >= LOG_INTERVAL_S:
             self._logged_at = now
             log.warning("flood link=%s unauthenticated=%d", name, self._unauthenticated())

@@ -52,6 +52,8 @@ ACK_BYTES = 4
 PARTIAL_ACK_BYTES = 8
 PART_BYTES = 9
 """Largest header of a part of an item: type, message, destination, position and parts, topic, length."""
+PRESENCE_BYTES = 5
+"""Of a presence, besides the name and the nodes that are heard."""
 HEARD_BYTES = 5
 
 

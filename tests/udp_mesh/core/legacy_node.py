@@ -1,7 +1,8 @@
-"""The legacy program with its socket and its loop, as its published source has them (docs/facts/legacy-wire.md).
+"""The loop of the legacy program, as its published source has it (docs/facts/legacy-wire.md): bytes and time in, bytes
+out. `SocketLegacyNode` adds its socket.
 
-One thread has the socket. Each turn of its loop takes one message of the programs, waits up to 10 ms for one datagram,
-and sends at most five fragments of broadcasts. A message to an offline peer is dropped.
+Each turn of the loop takes one message of the programs, waits up to 10 ms for one datagram, and sends at most five
+fragments of broadcasts. A message to an offline peer is dropped.
 """
 
 from __future__ import annotations
@@ -49,43 +50,45 @@ class Peer:
 
 
 class LegacyNode:
-    """The transport of one robot. `outgoing` takes messages from any thread, their `host` being the receiver;
-    `on_message` gets the source's name and what came from it."""
+    """The transport of one robot. `transmit` sends bytes to an address; `on_message` gets a source's name and what came
+    from it."""
 
     def __init__(
-        self, name: str, address: str, broadcast: str, on_message: Callable[[str, PriorityMeshData], None]
+        self,
+        name: str,
+        address: str,
+        broadcast: str,
+        transmit: Callable[[bytes, str], object],
+        on_message: Callable[[str, PriorityMeshData], None],
     ) -> None:
         self.name, self.address, self.broadcast = name, address, broadcast
+        self.transmit = transmit
         self.on_message = on_message
         self.peers: dict[str, Peer] = {}
         """By address, once heard."""
         self.broadcasts: list[LegacyPayload] = []
         self.broadcast_sequence = FIRST_BROADCAST
-        self.outgoing: queue.Queue[PriorityMeshData] = queue.Queue()
-        self.socket = socket.socket(type=socket.SOCK_DGRAM)
-        self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
-        self.socket.bind(("", PORT))
-        self._heartbeat_at = 0.0
+        self._heartbeat_at = float("-inf")
 
-    def turn(self) -> None:
-        """One turn of the loop."""
-        now = time.monotonic()
+    def begin_turn(self, message: PriorityMeshData | None, now: float) -> None:
+        """What a turn does before it waits for a datagram."""
         if now >= self._heartbeat_at:
             self._heartbeat_at = now + HEARTBEAT_S
             self.send(Host(self.name, self.address), self.broadcast)
-        with suppress(queue.Empty):
-            self.send_message(self.outgoing.get_nowait(), now)
-        if select.select([self.socket], [], [], SELECT_S)[0]:
-            raw, (address, _) = self.socket.recvfrom(65536)
-            if address != self.address:
-                self.receive(raw, address)
-        self.check_peers(time.monotonic())
+        if message is not None:
+            self.send_message(message, now)
+
+    def end_turn(self, received: tuple[bytes, str] | None, now: float) -> None:
+        """What it does then, with the datagram that came from this address."""
+        if received is not None and received[1] != self.address:
+            self.receive(*received, now)
+        self.check_peers(now)
         for fragment in self.broadcasts[:BROADCAST_FRAGMENTS]:
             self.send(fragment, self.broadcast)
         del self.broadcasts[:BROADCAST_FRAGMENTS]
 
     def send(self, datagram: LegacyDatagram, address: str) -> None:
-        self.socket.sendto(encode_legacy(datagram), (address, PORT))
+        self.transmit(encode_legacy(datagram), address)
 
     def send_message(self, message: PriorityMeshData, now: float) -> None:
         data = encode_mesh_data(message)
@@ -106,8 +109,7 @@ class LegacyNode:
         for fragment in peer.program.fill_in_flight(now):
             self.send(fragment, peer.address)
 
-    def receive(self, raw: bytes, address: str) -> None:
-        now = time.monotonic()
+    def receive(self, raw: bytes, address: str, now: float) -> None:
         try:
             datagram = decode_legacy(raw)
         except DecodeError:
@@ -138,3 +140,30 @@ class LegacyNode:
                 peer.is_offline = True
                 peer.program.flush()
             peer.program.prune(now)
+
+
+class SocketLegacyNode(LegacyNode):
+    """With a socket of its own. `outgoing` takes messages from any thread, their `host` being the receiver."""
+
+    def __init__(
+        self, name: str, address: str, broadcast: str, on_message: Callable[[str, PriorityMeshData], None]
+    ) -> None:
+        self.socket = socket.socket(type=socket.SOCK_DGRAM)
+        self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
+        self.socket.bind(("", PORT))
+        self.outgoing: queue.Queue[PriorityMeshData] = queue.Queue()
+        super().__init__(
+            name, address, broadcast, lambda data, host: self.socket.sendto(data, (host, PORT)), on_message
+        )
+
+    def turn(self) -> None:
+        """One turn of the loop."""
+        message = None
+        with suppress(queue.Empty):
+            message = self.outgoing.get_nowait()
+        self.begin_turn(message, time.monotonic())
+        received = None
+        if select.select([self.socket], [], [], SELECT_S)[0]:
+            raw, (address, _) = self.socket.recvfrom(65536)
+            received = raw, address
+        self.end_turn(received, time.monotonic())

@@ -8,7 +8,7 @@ Messages and changes for some seconds, then everything is repaired. Throughout a
   acknowledgements mean;
 - a datagram takes effect once, and not long after it was sent (`taken_once`);
 - no timer of a node stays in the past, also where timers come late;
-- nothing is left over, and an idle team is quiet.
+- nothing is left over, and an idle team is quiet: few datagrams, and few wake-ups of each node.
 """
 
 from __future__ import annotations
@@ -20,8 +20,9 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from unittest.mock import patch
 
+from tests.udp_mesh.core.busy_teams import BusyTeam
 from tests.udp_mesh.core.hostile_teams import HostileTeam
-from tests.udp_mesh.core.random_teams import LOG, TOPICS, Broken, RandomTeam
+from tests.udp_mesh.core.random_teams import LOG, Broken, RandomTeam
 from tests.udp_mesh.core.taken_once import effects_watched
 from udp_mesh.core import transmit
 from udp_mesh.core.interfaces import Datagram
@@ -38,7 +39,7 @@ from udp_mesh.core.state import State
 
 MAX_STEPS_PER_S = 60_000
 """Datagrams, timers and calls of all nodes in a second of virtual time: more is a loop."""
-MAX_IDLE_DATAGRAMS_PER_S = 15
+MAX_IDLE_DATAGRAMS_PER_S, MAX_IDLE_WAKEUPS_PER_S = 15, 40
 SETTLE_S, LEAST_BYTES_PER_S = 90.0, 15_000
 """After the repair everything ends within this time, and what waits at that rate: more than one round of offline, lost
 and found again, and half of the limited topic's rate."""
@@ -126,7 +127,7 @@ def check_finished(team: RandomTeam) -> None:
                 raise Broken(f"{name} has not finished with {peer.name}: {_shown(peer)}")
             if not peer.online:
                 raise Broken(f"{name} does not reach {peer.name}")
-    before, steps = Counter(team.datagrams), 0
+    before, wakeups, steps = Counter(team.datagrams), Counter(team.wakeups), 0
     end = team.now + 10.0
     while team.event_queue.step(end):
         steps += 1
@@ -134,6 +135,8 @@ def check_finished(team: RandomTeam) -> None:
         sent = team.datagrams[name] - before[name]
         if sent > 10 * MAX_IDLE_DATAGRAMS_PER_S * len(team.homes[name]):
             raise Broken(f"{name} sends {sent / 10:.0f} datagrams a second although it has nothing to send")
+        if (woken := team.wakeups[name] - wakeups[name]) > 10 * MAX_IDLE_WAKEUPS_PER_S:
+            raise Broken(f"{name} wakes {woken / 10:.0f} times a second although there is nothing to do")
     if steps > 10 * 200 * len(team.nodes):
         raise Broken(f"{steps / 10:.0f} steps a second although there is nothing to do")
 
@@ -189,14 +192,14 @@ def priorities_watched() -> Iterator[None]:
         yield
 
 
-def play(seed: int, seconds: float, *, hostile: bool = False) -> RandomTeam:
+def play(seed: int, seconds: float, kind: type[RandomTeam] = RandomTeam) -> RandomTeam:
     """Messages and changes for so long, then none."""
-    team = HostileTeam(seed) if hostile else RandomTeam(seed)
+    team = kind(seed)
     with priorities_watched(), numbers_watched(), effects_watched(team):
         dice = team.dice
         go(team, 2.0)
         end = team.now + seconds
-        topics = dice.sample(TOPICS, dice.randint(2, len(TOPICS)))
+        topics = dice.sample(team.topics, dice.randint(2, len(team.topics)))
         if LOG in team.config["a"].topics:
             topics.append(LOG)
         change = dice.choice((0.02, 0.1, 0.2))
@@ -239,11 +242,13 @@ def main() -> None:
     parser.add_argument("last", type=int)
     parser.add_argument("--seconds", type=float, default=20.0)
     parser.add_argument("--hostile", action="store_true", help="networks also replay, damage and filter")
+    parser.add_argument("--busy", action="store_true", help="computers are busy; legacy programs and thin links")
     arguments = parser.parse_args()
+    kind = HostileTeam if arguments.hostile else BusyTeam if arguments.busy else RandomTeam
     failed = 0
     for seed in range(arguments.first, arguments.last):
         try:
-            play(seed, arguments.seconds, hostile=arguments.hostile)
+            play(seed, arguments.seconds, kind)
         except Exception as error:  # noqa: BLE001
             failed += 1
             sys.stdout.write(f"seed {seed}: {type(error).__name__}: {str(error)[:600]}\n")

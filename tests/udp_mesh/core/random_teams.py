@@ -100,6 +100,8 @@ class SlowDisk(Disk):
 class RandomTeam(Topology):
     """A team that follows from its seed."""
 
+    topics: tuple[Topic, ...] = TOPICS
+
     def __init__(self, seed: int) -> None:
         super().__init__(seed)
         self.dice = random.Random(seed)
@@ -127,6 +129,8 @@ class RandomTeam(Topology):
         self.reading: set[str] = set()
         self.suspended: dict[str, Endpoint] = {}
         self.datagrams: Counter[str] = Counter()
+        self.wakeups: Counter[str] = Counter()
+        """By node: how often its timer came."""
         self.serial = 0
         self.timers_late_s = (0.0, 0.001, 0.05)[seed % 3]
         self._starting: list[tuple[str, Event]] | None = None
@@ -155,8 +159,8 @@ class RandomTeam(Topology):
             # A line of networks, so that everyone is connected, if need be through relays.
             line = networks[min(place, len(networks) - 1)], networks[max(0, min(place, len(networks) - 1) - 1)]
             self.homes[name] = tuple(dict.fromkeys([*homes, *line]))
-            topics = (*TOPICS, LOG) if logs else TOPICS
-            self.config[name] = Settings(
+            topics = (*self.topics, LOG) if logs else self.topics
+            settings = Settings(
                 name=name,
                 keys=(KEY,),
                 topics=topics,
@@ -166,12 +170,17 @@ class RandomTeam(Topology):
                 relay=RelaySettings(all=len(networks) > 1 or dice.random() < 0.2),
                 rates=RATES,
             )
+            self.config[name] = self.equipped(place, settings)
             self.disks[name] = SlowDisk()
             self.log_stores[name] = MemoryLogStore(self.rng.randbytes(32), clock=lambda: self.now)
             self.received[name], self.unread[name] = Counter(), []
             self.arrived[name], self.confirmed[name] = set(), set()
             self.reading.add(name)
             self.start(name)
+
+    def equipped(self, place: int, settings: Settings) -> Settings:
+        """The settings of a node with what else its computer has."""
+        return settings
 
     def start(self, name: str) -> None:
         """Start a node that does not run."""
@@ -203,6 +212,11 @@ class RandomTeam(Topology):
         if self.nodes.get(name) is not node or self._wakes_at[name] != at:
             return
         super()._wake(name, node, at)
+        self.check_timer(name, node)
+
+    def check_timer(self, name: str, node: Endpoint) -> None:
+        """After a node did what was due: its next timer is not due again at once, unless it is few times in a row."""
+        self.wakeups[name] += 1
         due = node.next_timer()
         # Compression and the like are due at once until they are done.
         if due is None or due == float("-inf") or due > self.clock(name):
@@ -224,14 +238,14 @@ class RandomTeam(Topology):
         run = self.runs[name]
         for key, sent in list(self.sent.items()):
             if key[:2] == (name, run) and not sent.ends:
-                if politely and sent.key not in {_key(kept.payload) for kept in self.disks[name].kept.values()}:
+                if politely and sent.key not in {key_of(kept.payload) for kept in self.disks[name].kept.values()}:
                     raise Broken(f"{sent} has no outcome although its node was closed")
                 del self.sent[key]
 
     # Messages
 
     def _record(self, source: str, message_id: int, peer: str, topic: str, payload: bytes) -> None:
-        self.sent[source, self.runs[source], message_id, peer] = Sent(source, topic, _key(payload), self.now)
+        self.sent[source, self.runs[source], message_id, peer] = Sent(source, topic, key_of(payload), self.now)
 
     def publish(self, source: str, topic: Topic, target: str | None) -> None:
         self.serial += 1
@@ -249,8 +263,8 @@ class RandomTeam(Topology):
             if topic.reliable and target is not None:
                 self._record(source, result, target, topic.name, payload)
             else:
-                self.to_all[source, self.runs[source], result] = _key(payload)
-                self.broadcast.add(_key(payload))
+                self.to_all[source, self.runs[source], result] = key_of(payload)
+                self.broadcast.add(key_of(payload))
         for name, event in events:
             self._on_event(name, event, self.now)
 
@@ -267,7 +281,7 @@ class RandomTeam(Topology):
     def _on_received(self, name: str, event: MessageReceived) -> None:
         if b"|" not in event.payload[:40]:
             raise Broken(f"{name} received something that nobody sent: {event.payload[:40]!r}")
-        key = _key(event.payload)
+        key = key_of(event.payload)
         got = self.runs[name], key
         self.received[name][got] += 1
         self.arrived[name].add(key)
@@ -376,7 +390,7 @@ class RandomTeam(Topology):
                 else:
                     self.reading.discard(name)
             case "wants" if name in self.nodes:
-                topics = dice.sample(TOPICS, dice.randint(0, len(TOPICS)))
+                topics = dice.sample(self.topics, dice.randint(0, len(self.topics)))
                 self.nodes[name].selective.set_subscriptions(
                     [Subscription(topic.name, Bounds(dice.choice((None, None, 2.0)), None)) for topic in topics],
                     self.clock(name),
@@ -457,6 +471,11 @@ class RandomTeam(Topology):
 
     # What is left
 
+    @property
+    def arrived_at(self) -> float:
+        """When the datagram that is being received arrived."""
+        return self.now
+
     def _on_datagram(self, name: str, network: str, datagram: Datagram, now: float) -> None:
         self.datagrams[name] += 1
 
@@ -474,5 +493,5 @@ class RandomTeam(Topology):
         return sum(node.conditions(self.clock(name)).partial_bytes for name, node in self.nodes.items())
 
 
-def _key(payload: bytes) -> bytes:
+def key_of(payload: bytes) -> bytes:
     return payload[: payload.index(b"|")]

@@ -61,7 +61,7 @@ class Effects:
         sent_at = self._sealed_at.get(self._seal)
         if sent_at is None:
             raise Broken(f"a datagram that no node sent took effect at {state.settings.name} as from {session.name}")
-        age_s, boots = self._team.now - sent_at, (state.boot_id, session.boot_id)
+        age_s, boots = self._team.arrived_at - sent_at, (state.boot_id, session.boot_id)
         least_s = self._least_ages_s[boots] = min(age_s, self._least_ages_s.get(boots, age_s))
         if age_s > (least_s + ACCEPT_AGE_S + CLOCK_ERROR_S if timestamped else MAX_AGE_S) or age_s > MAX_AGE_S:
             raise Broken(f"a datagram from {session.name} took effect at {state.settings.name} {age_s:.1f} s later")

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from tests.udp_mesh.core.busy_teams import BusyTeam
+from tests.udp_mesh.core.hostile_teams import HostileTeam
 from tests.udp_mesh.core.promises import play
 
 
@@ -14,7 +16,12 @@ def test_every_promise_is_kept_whatever_happens(seed: int) -> None:
 
 @pytest.mark.parametrize("seed", [3, 4, 7])
 def test_every_promise_is_kept_by_hostile_networks(seed: int) -> None:
-    play(seed, 8.0, hostile=True)
+    play(seed, 8.0, HostileTeam)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2, 15])
+def test_every_promise_is_kept_by_busy_computers(seed: int) -> None:
+    play(seed, 6.0, BusyTeam)
 
 
 def test_a_boot_that_is_first_heard_over_an_unplugged_link_gets_what_waits() -> None:
@@ -37,7 +44,17 @@ def test_every_promise_is_kept_in_three_thousand_teams() -> None:
 def test_every_promise_is_kept_by_a_thousand_hostile_networks() -> None:
     for seed in range(1000):
         try:
-            play(seed, 20.0, hostile=True)
+            play(seed, 20.0, HostileTeam)
+        except AssertionError as error:
+            raise AssertionError(f"seed {seed}: {error}") from error
+
+
+@pytest.mark.proof
+@pytest.mark.timeout(4 * 3600)
+def test_every_promise_is_kept_by_a_thousand_busy_teams() -> None:
+    for seed in range(1000):
+        try:
+            play(seed, 20.0, BusyTeam)
         except AssertionError as error:
             raise AssertionError(f"seed {seed}: {error}") from error
 

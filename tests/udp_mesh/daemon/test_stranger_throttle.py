@@ -10,7 +10,7 @@ import pytest
 
 from tests.udp_mesh.daemon.test_bulk_ticks import ManualLoop
 from tests.udp_mesh.links.sockets import free_port, open_link
-from udp_mesh.daemon.stranger_throttle import FLOOD_DATAGRAMS, MIN_PAUSE_S, PAUSE, StrangerThrottle
+from udp_mesh.daemon.stranger_throttle import FLOOD_DATAGRAMS, MAX_PAUSE_S, MIN_PAUSE_S, PAUSE, StrangerThrottle
 from udp_mesh.links.udp import UdpLink
 
 BATCH = 256
@@ -24,12 +24,13 @@ class Strangers:
         self.loop = ManualLoop()
         self.limits: list[int] = []
         self.waiting, self.forged, self.unauthenticated = 1000, 1.0, 0
+        self.read_s = READ_S
         loop = cast("asyncio.AbstractEventLoop", self.loop)
         self.throttle = StrangerThrottle(loop, self._read, lambda: self.unauthenticated, batch=BATCH)
         self.throttle.watch(link)
 
     def _read(self, _: UdpLink, limit: int) -> int:
-        self.loop.now += READ_S
+        self.loop.now += self.read_s
         self.limits.append(limit)
         count = min(limit, self.waiting)
         self.unauthenticated += int(self.forged * count)
@@ -62,6 +63,15 @@ def test_a_flood_is_read_in_small_batches_for_a_fifth_of_the_time() -> None:
         strangers.wake()
         strangers.wake()
         assert strangers.limits[3:] == [FLOOD_DATAGRAMS, BATCH]
+
+
+def test_after_a_process_was_suspended_strangers_are_heard_soon() -> None:
+    """The time of the suspension was taken for what reading had cost: new robots were not heard for minutes."""
+    with closing(open_link("127.0.1.4", free_port())) as link:
+        strangers = Strangers(link)
+        strangers.read_s = 30.0
+        strangers.wake()
+        assert strangers.end_pause() == pytest.approx(MAX_PAUSE_S)
 
 
 @pytest.mark.parametrize(("waiting", "forged"), [(FLOOD_DATAGRAMS // 2 - 1, 1.0), (1000, 0.5)])

@@ -234,3 +234,11 @@ def test_mistakes_in_the_configuration_are_reported(text: str, problem: str) -> 
     with pytest.raises(ConfigurationError) as caught:
         read(parse(f'name = "a"\nunkeyed = true\n{text}', "file.toml"), ())
     assert problem in str(caught.value)
+
+
+def test_a_name_that_does_not_fit_the_frames_is_refused_at_its_line() -> None:
+    text = '[thin]\nnumber = 3\n[[thin.links]]\ndevice = "/dev/x"\nframe_bytes = 40\n'
+    with pytest.raises(ConfigurationError) as caught:
+        read(parse(f'unkeyed = true\nname = "base-station-2"\n{text}', "file.toml"), ())
+    assert "file.toml:2: name: expected a name of at most 12 bytes" in str(caught.value)
+    assert "frames of thin link thin have 40 bytes, found base-station-2" in str(caught.value)

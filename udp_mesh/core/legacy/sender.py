@@ -8,6 +8,9 @@ The legacy receiver does not remember finished messages: it delivers a message a
 again. So no message is sent as a single fragment: a short one is followed by an empty second fragment, which is
 retransmitted only after the first one is acknowledged. A message then arrives twice only if both acknowledgments are
 lost, or both late.
+
+It discards the fragments of a message 10 s after the last one arrived, although it acknowledged them. A message that
+was interrupted for almost as long is sent again from its start.
 """
 
 from collections import OrderedDict
@@ -51,6 +54,9 @@ MAX_TIMEOUT_S = 0.2
 """Upper bound of that minimum, which grows if both transmissions of a fragment are acknowledged: the second was
 needless."""
 
+MAX_PAUSE_S = 8.0
+"""A message of which no fragment arrived for longer than this is restarted: after 10 s the receiver has none of it."""
+
 RESENT_REMEMBERED = 64
 """Fragments acknowledged after a retransmission that may be acknowledged again."""
 
@@ -70,6 +76,8 @@ class _SentFragment:
     """Acknowledgments of any fragment received when it was last sent."""
     unanswered: int
     """Its attempts since the last of them."""
+    attempted_at: float
+    """When it was last sent; `sent_at` may be set to let it be sent again at once."""
 
 
 def can_publish(type_name: str) -> bool:
@@ -84,6 +92,7 @@ class LegacySender:
 
     __slots__ = (
         "_acks",
+        "_arrived_at",
         "_fragments",
         "_in_flight",
         "_min_timeout_s",
@@ -109,9 +118,14 @@ class LegacySender:
         self._in_flight: dict[tuple[int, int], _SentFragment] = {}
         self._sequences: dict[int, OutgoingMessage] = {}
         self._fragments: dict[OutgoingMessage, tuple[int, list[bytes]]] = {}
+        self._arrived_at: dict[OutgoingMessage, float] = {}
+        """When the newest fragment that is acknowledged was sent, at the latest attempt: it arrived soon after."""
 
     def send(self, link: str, address: Address, now: float, out: list[Datagram]) -> None:
         """Send what may be sent now: overdue fragments first, then new ones, most urgent first."""
+        if not self.unresponsive:
+            for message in [message for message in self._arrived_at if self._is_interrupted(message, now)]:
+                self.sender.resend_from_start(message)
         self._forget_ended()
         self._resend(link, address, now, out)
         sender = self.sender
@@ -157,12 +171,19 @@ class LegacySender:
             # Karn's algorithm: after a retransmission the acknowledged attempt is unknown.
             self.sender.rtt.sample(max(1e-5, now - sent.sent_at), now)
         message = sent.message
-        if not message.ended and message.mark_arrived(position):
+        if self._is_interrupted(message, now):
+            self.sender.resend_from_start(message)
+        elif not message.ended and message.mark_arrived(position):
+            self._arrived_at[message] = max(sent.attempted_at, self._arrived_at.get(message, sent.attempted_at))
             self.sender.delivered_bytes += len(self._fragments[message][1][position])
             if not message.missing:
                 self.sender.finish(message, Outcome.DELIVERED)
         self.sender.delivered_packets += 1
         self.sender.delivered_at = now
+
+    def _is_interrupted(self, message: OutgoingMessage, now: float) -> bool:
+        """Whether the receiver may have discarded the fragments that arrived."""
+        return not message.ended and now - self._arrived_at.get(message, now) > MAX_PAUSE_S
 
     def on_activity(self) -> None:
         """Something came from an unresponsive peer: everything in flight is due at once."""
@@ -272,7 +293,9 @@ class LegacySender:
         sequence, fragments = self._fragments[message]
         before = self._in_flight.get((sequence, position))
         unanswered = before.unanswered + 1 if before is not None and before.acks == self._acks else 1
-        self._in_flight[(sequence, position)] = _SentFragment(message, position, now, tries, self._acks, unanswered)
+        self._in_flight[(sequence, position)] = _SentFragment(
+            message, position, now, tries, self._acks, unanswered, now
+        )
         payload = LegacyPayload(sequence, position, len(fragments), fragments[position], wants_ack=True)
         data = encode_legacy(payload)
         urgent = message.priority <= self.sender.rates.urgent_priority
@@ -283,6 +306,7 @@ class LegacySender:
     def _forget_ended(self) -> None:
         for message in [message for message in self._fragments if message.ended]:
             sequence, fragments = self._fragments.pop(message)
+            self._arrived_at.pop(message, None)
             del self._sequences[sequence]
             for position in range(len(fragments)):
                 self._in_flight.pop((sequence, position), None)

@@ -6,10 +6,16 @@ import math
 from dataclasses import dataclass
 
 from udp_mesh.wire.limits import MAX_THIN_FRAME_BYTES, MAX_THIN_NUMBER
-from udp_mesh.wire.thin import topic_hash
+from udp_mesh.wire.thin import (
+    HEARD_BYTES,
+    INTRODUCTION_BYTES,
+    PRESENCE_BYTES,
+    THIN_OVERHEAD_BYTES,
+    topic_hash,
+)
 
 MIN_FRAME_BYTES = 40
-"""Room for a presence with a name of 14 bytes, and for some payload."""
+"""Room for a presence with a name of 12 bytes and one node that is heard."""
 
 BURST_SHARE = 0.25
 """Part of a window's airtime that may be used at once; the rest comes evenly in the course of the window."""
@@ -101,6 +107,18 @@ class ThinSettings:
         names = [link.name for link in self.links]
         if len(set(names)) != len(names):
             raise ValueError(f"thin.links: expected each name once, found {', '.join(names)}")
+
+
+def check_presence(name: str, links: tuple[ThinLinkSettings, ...]) -> None:
+    """Raises ValueError if a presence with this name and one node that is heard does not fit a link's frames: the node
+    could not introduce itself."""
+    needed = THIN_OVERHEAD_BYTES + INTRODUCTION_BYTES + PRESENCE_BYTES + len(name.encode()) + HEARD_BYTES
+    for link in links:
+        if link.largest_frame_bytes < needed:
+            raise ValueError(
+                f"name: expected a name of at most {len(name.encode()) - needed + link.largest_frame_bytes} bytes, "
+                f"because frames of thin link {link.name} have {link.largest_frame_bytes} bytes, found {name}"
+            )
 
 
 def check_topics(names: list[str]) -> None:

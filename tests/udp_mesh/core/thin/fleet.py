@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -38,11 +39,19 @@ class ThinFleet:
     frame before it is on the air (None: lost), and `frames` records all."""
 
     def __init__(
-        self, *names: str, link: ThinLinkSettings = RADIO, loss: float = 0.0, seed: int = 1, **changes: object
+        self,
+        *names: str,
+        link: ThinLinkSettings = RADIO,
+        loss: float = 0.0,
+        seed: int = 1,
+        timers_late_s: float = 0.0,
+        **changes: object,
     ) -> None:
+        """Timers come up to `timers_late_s` late, as on busy computers."""
         self.event_queue = SimEventQueue()
         self.rng = random.Random(seed)
         self.loss = loss
+        self.timers_late_s = timers_late_s
         self.apart: set[str] = set()
         """Nodes out of the thin link's range."""
         self.wifi: set[str] = set()
@@ -54,6 +63,7 @@ class ThinFleet:
         self._names = list(names)
         self._changes = changes
         self._wakes_at: dict[str, float] = {}
+        self._past_timers: Counter[str] = Counter()
         self.medium = ThinMedium(self.event_queue, link, names, self._loss, self._arrive, self.rng)
         for name in names:
             self.start(name)
@@ -124,7 +134,8 @@ class ThinFleet:
             self.events[name].append((self.now, event))
         at = node.next_timer()
         if at is not None and at < self._wakes_at[name]:
-            self._wakes_at[name] = at = max(at, self.now + 1e-6)
+            late_s = self.rng.random() * self.timers_late_s if self.timers_late_s else 0.0
+            self._wakes_at[name] = at = min(self._wakes_at[name], max(at, self.now + 1e-6) + late_s)
             self.event_queue.at(at, partial(self._wake, name, node, at))
 
     def _wake(self, name: str, node: Endpoint, at: float) -> None:
@@ -132,6 +143,10 @@ class ThinFleet:
             self._wakes_at[name] = float("inf")
             node.handle_timer(self.now)
             self.pump(name)
+            due = node.next_timer()
+            in_the_past = due is not None and due <= self.now
+            self._past_timers[name] = self._past_timers[name] + 1 if in_the_past else 0
+            assert self._past_timers[name] < 4, f"{name} runs in circles: its next timer stays in the past"
 
     def _transmit(self, name: str, datagram: Datagram) -> None:
         if datagram.link == WIFI:

@@ -42,6 +42,27 @@ def test_nodes_know_each_other_soon_and_then_send_little(seed: int) -> None:
         assert (airtime_s - before[name]) / 600 < 0.01
 
 
+@pytest.mark.parametrize("timers_late_s", [0.001, 0.3, 5.0])
+def test_nodes_whose_timers_come_late_meet_and_are_quiet(timers_late_s: float) -> None:
+    """The fleet fails once a timer stays in the past."""
+    fleet = met("base", "husky", "spot", loss=0.1, timers_late_s=timers_late_s)
+    fleet.send("base", "estop", b"stop")
+    fleet.send("husky", "report", bytes(300), "base")
+    fleet.run(200)
+    assert fleet.received("spot", "estop") == [b"stop"]
+    assert fleet.received("base", "report") == [bytes(300)]
+
+
+@pytest.mark.parametrize("frame_bytes", [40, 41, 51])
+def test_the_longest_name_that_fits_a_frame_is_heard_and_a_longer_one_refused(frame_bytes: int) -> None:
+    """A node whose presence did not fit composed it again and again, and used a whole processor core."""
+    link = replace(RADIO, frame_bytes=frame_bytes)
+    longest = frame_bytes - 28
+    met("n" * longest, "m" * longest, "k" * longest, link=link)
+    with pytest.raises(ValueError, match=f"name: expected a name of at most {longest} bytes, because frames of thin"):
+        ThinFleet("n" * (longest + 1), link=link)
+
+
 def test_a_silent_node_is_reported_and_forgotten_a_returning_one_is_back() -> None:
     fleet = met("base", "husky")
     fleet.apart.add("husky")

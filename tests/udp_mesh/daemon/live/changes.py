@@ -16,7 +16,7 @@ NETWORK_CHANGES = (
 ROBOT_CHANGES = (
     *("kill", "leave", "suspend", "disk", "reader", "pause", "writer"),
     *("move", "unplug", "renumber", "refuse", "reload", "stranger", "twin", "second", "read-only", "clock", "link-mtu"),
-    *("no-buffers", "radio"),
+    *("no-buffers", "radio", "busy"),
 )
 LEGACY_CHANGES = ("down", "one-way", "loss", "jitter", "heal", "restart")
 """Of the way to the legacy robot, and of that."""
@@ -107,6 +107,9 @@ def change_robot(team: LiveTeam, kind: str, name: str) -> None:
             team.disk_trouble.add(name)
             robot.fill_disk()
             team.later(dice.choice((0.5, 5.0)), robot.free_disk)
+        case "busy":
+            robot.set_busy(True)
+            team.later(dice.choice((1.0, 4.0)), partial(robot.set_busy, False))
         case "reader":
             team.close_reader(name)
             team.later(dice.choice((0.0, 0.3, 4.0)), partial(team.open_reader, name))

@@ -17,7 +17,7 @@ from collections import deque
 from pathlib import Path
 from typing import NamedTuple
 
-from tests.udp_mesh.core.legacy_node import TO_ALL, TYPE, LegacyNode
+from tests.udp_mesh.core.legacy_node import TO_ALL, TYPE, SocketLegacyNode
 from tests.udp_mesh.daemon.live.ether import Ether
 from tests.udp_mesh.daemon.live.programs import Broken, Sent, key_of, payload_of
 from tests.udp_mesh.daemon.live.radio import Radio
@@ -134,7 +134,7 @@ def main() -> None:
         sys.stdout.write(json.dumps({"source": source, "topic": message.topic, "data": data}) + "\n")
         sys.stdout.flush()
 
-    node = LegacyNode(name, address, broadcast, on_message)
+    node = SocketLegacyNode(name, address, broadcast, on_message)
 
     def read() -> None:
         for line in sys.stdin:

@@ -26,7 +26,9 @@ AFTER_REPAIR = "repaired"
 SMALL, LARGE = (60, 100, 100, 300, 1_380, 1_400), (1_420, 9_000, 60_000, 200_000)
 SETTLE_S, LEAST_BYTES_PER_S = 120.0, 15_000
 """After the repair everything ends within this time even on a busy machine, and what waits at that rate."""
-MAX_IDLE_LOAD, MAX_IDLE_DATAGRAMS_PER_S = 0.15, 15
+MAX_IDLE_TURNS_PER_S, MAX_IDLE_DATAGRAMS_PER_S = 100, 15
+MAX_IDLE_LOAD = 0.15
+"""Of a daemon whose turns are not counted."""
 MAX_LOG_LINES = 2000
 MAX_MEMORY_BYTES = 300 << 20
 
@@ -42,6 +44,7 @@ def repair(team: LiveTeam) -> None:
         robot.set_disk("rw")
         robot.free_disk()
         robot.refuse_none()
+        robot.set_busy(False)
         robot.resume()
         for radio in robot.radios:
             radio.allow_to_send()
@@ -168,17 +171,24 @@ def check_finished(team: LiveTeam) -> None:
 
 
 def what_is_busy(team: LiveTeam) -> list[str]:
-    """Robots that use the processor or the network within the next seconds."""
-    before = {name: robot.usage()[0] for name, robot in team.robots.items()}
+    """Robots whose event loop or network is busy within the next seconds. Turns of the loop are counted because a loop
+    without an end gets any share of the processors of a busy machine."""
+    before = {name: (robot.usage()[0], robot.turns()) for name, robot in team.robots.items()}
     datagrams, began = count_datagrams(team), time.monotonic()
     team.go(3.0)
     took_s = time.monotonic() - began
     found = []
     for name, robot in team.robots.items():
-        load = (robot.usage()[0] - before[name]) / took_s
+        load_before, turns_before = before[name]
+        load, turns = (robot.usage()[0] - load_before) / took_s, robot.turns()
         rate = (count_datagrams(team)[name] - datagrams[name]) / took_s
-        if load > MAX_IDLE_LOAD or rate > MAX_IDLE_DATAGRAMS_PER_S * len(team.robots) * len(team.ethers):
-            found.append(f"{name} uses {load:.2f} core and sends {rate:.0f} datagrams a second")
+        if turns is None or turns_before is None:
+            is_busy, what = load > MAX_IDLE_LOAD, f"uses {load:.2f} core"
+        else:
+            turns_per_s = (turns - turns_before) / took_s
+            is_busy, what = turns_per_s > MAX_IDLE_TURNS_PER_S, f"wakes {turns_per_s:.0f} times a second"
+        if is_busy or rate > MAX_IDLE_DATAGRAMS_PER_S * len(team.robots) * len(team.ethers):
+            found.append(f"{name} {what} and sends {rate:.0f} datagrams a second")
     return found
 
 

@@ -76,6 +76,7 @@ class Robot:
         self._filler = folder / f"{name}.disk" / "filler"
         self._clock = folder / f"{name}.clock"
         self._clock.touch()
+        self._counts_turns = version is None
         # Ends with this process, whose end of the pipe is then closed.
         self.holder = subprocess.Popen(["unshare", "--net", "cat"], stdin=subprocess.PIPE)
         disk = folder / f"{name}.disk"
@@ -157,6 +158,17 @@ state_directory = "{folder}/{self.name}.disk"
 
     def refuse_none(self) -> None:
         self._clock.with_suffix(".refused").unlink(missing_ok=True)
+
+    def set_busy(self, busy: bool) -> None:
+        """Turns of the daemon's event loop come late from now on, or no longer."""
+        if busy:
+            self._clock.with_suffix(".busy").touch()
+        else:
+            self._clock.with_suffix(".busy").unlink(missing_ok=True)
+
+    def turns(self) -> int | None:
+        """Turns of the daemon's event loop so far (None: of another version, which does not count them)."""
+        return int.from_bytes(self._clock.with_suffix(".turns").read_bytes(), "little") if self._counts_turns else None
 
     def start_second(self) -> None:
         """Start the daemon once more while it runs. Raises Broken unless that is refused."""

@@ -1,16 +1,20 @@
-"""A daemon whose wall clock is set while it runs: `python -m tests.udp_mesh.daemon.live.stepped_clock CLOCK run FILE`.
+"""A daemon whose wall clock is set while it runs, on a computer that may be busy:
+`python -m tests.udp_mesh.daemon.live.stepped_clock CLOCK run FILE`.
 
 The host's clock cannot be set for one process alone. Here `time.time` and the kernel's timestamps of datagrams are
 moved by the last line of the file CLOCK, in seconds. What arrived before that line was written has the offset before
 it, as after settimeofday(2). With SMALL_BUFFERS in the environment, the sockets hold a few datagrams only. While the
 file CLOCK.refused exists, the kernel refuses some datagrams with the errors that it names, such as `ENOBUFS EAGAIN`.
+While CLOCK.busy exists, turns of the event loop come late. The file CLOCK.turns has the number of turns so far.
 """
 
 from __future__ import annotations
 
 import errno
+import mmap
 import os
 import random
+import selectors
 import sys
 import time
 from collections.abc import Sequence
@@ -23,6 +27,9 @@ from udp_mesh.links.attachments import Address
 SMALL_BUFFER_BYTES = 8192
 """The kernel doubles it and counts its own overhead: about ten full datagrams."""
 REFUSED_SHARE = 0.3
+LATE_S = (0.0, 0.0, 0.001, 0.02, 0.3)
+"""A turn of a busy computer's event loop comes so late."""
+TURNS_BYTES = 8
 _real_time = time.time
 
 
@@ -59,6 +66,28 @@ class SteppedClock:
         return _real_time() + self.offset_s()
 
 
+def watch_turns(turns_file: Path, busy_file: Path, rng: random.Random) -> None:
+    """Count the turns of the event loop, and let them come late while the second file exists."""
+    turns_file.write_bytes(bytes(TURNS_BYTES))
+    with turns_file.open("r+b") as file:
+        counter = mmap.mmap(file.fileno(), TURNS_BYTES)
+    select = selectors.EpollSelector.select
+    turns = 0
+
+    def watched(self: selectors.EpollSelector, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
+        nonlocal turns
+        turns += 1
+        counter[:] = turns.to_bytes(TURNS_BYTES, "little")
+        found = select(self, timeout)
+        if busy_file.exists() and (late_s := rng.choice(LATE_S)):
+            time.sleep(late_s)
+            # What became ready meanwhile.
+            found = select(self, 0)
+        return found
+
+    selectors.EpollSelector.select = watched  # type: ignore[assignment, method-assign]
+
+
 def main() -> int:
     clock_file = Path(sys.argv.pop(1))
     clock = SteppedClock(clock_file)
@@ -85,6 +114,7 @@ def main() -> int:
 
     if "SMALL_BUFFERS" in os.environ:
         udp.RECEIVE_BUFFER_BYTES = udp.STRANGERS_BUFFER_BYTES = udp.SEND_BUFFER_BYTES = SMALL_BUFFER_BYTES
+    watch_turns(clock_file.with_suffix(".turns"), clock_file.with_suffix(".busy"), rng)
     time.time = clock.time
     udp.UdpLink._receive = received  # type: ignore[method-assign]
     udp.UdpLink._send_run = sent  # type: ignore[method-assign]
