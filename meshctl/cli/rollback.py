@@ -25,7 +25,7 @@ from meshctl.cli.context import (
 from meshctl.cli.output import echo
 from meshctl.cli.plan import AcceptCut, Brief, Direct, LeaveBehind, Rate, Together, Yes
 from meshctl.cli.plan_execution import PlanRefused, choices_of, confirm_and_execute, prepare_plan
-from meshctl.cli.run_record import run_of
+from meshctl.cli.run_record import run_number, run_of
 from meshctl.cli.site_files import with_states
 from meshctl.cli.site_runs import RunOptions, change_everywhere, meet, sites_of
 from meshctl.errors import ExitCode, InputError
@@ -46,7 +46,7 @@ _REASONS = {
 
 
 def rollback(
-    run: Annotated[int, typer.Argument(help="Run number, from `meshctl history`.")],
+    run: Annotated[str, typer.Argument(help="Run number, from `meshctl history`, or `last`: the fleet's latest run.")],
     nodes: Nodes = None,
     limit: Limit = None,
     inventory: InventoryPath = Path(),
@@ -70,6 +70,7 @@ def rollback(
     """
     with session(inventory, key_files=key or (), lab=lab, changes_nothing=dry_run) as opened:
         record = _record(opened, run)
+        number = record.id
         selected = {node.name for node in selected_nodes(opened.fleet, nodes, limit)} if nodes or limit else None
         # how parts of it ended that were left to their sites
         meet(opened, record, as_json=as_json)
@@ -79,7 +80,7 @@ def rollback(
         own, sites = sites_of(opened, list(states), None, direct=direct)
         try:
             if sites:
-                options = RunOptions("rollback", choices, as_json, rate, undoes=run)
+                options = RunOptions("rollback", choices, as_json, rate, undoes=number)
                 raise change_everywhere(opened, inventory, own, sites, options, yes=yes, brief=brief, dry_run=dry_run)
             prepared = prepare_plan(opened, own, choices, reconnects=not dry_run)
             confirm_and_execute(
@@ -92,18 +93,22 @@ def rollback(
                 brief=brief,
                 rate=rate,
                 dry_run=dry_run,
-                undoes=run,
+                undoes=number,
             )
         except typer.Exit as ended:
             if ended.exit_code == ExitCode.OK and not dry_run:
-                text = f"the inventory still describes run {run}: revert it, or the next `meshctl provision` applies it"
+                text = (
+                    f"the inventory still describes run {number}: revert it, or the next `meshctl provision` applies it"
+                )
                 echo(text, err=True)
             raise
 
 
-def _record(opened: Session, run_id: int) -> RunRecord:
+def _record(opened: Session, run: str) -> RunRecord:
     """The run. Raises InputError for none of this fleet, PlanRefused for one that no plan takes back."""
-    record = run_of(opened.journal, opened.fleet.name, run_id)
+    fleet = opened.fleet.name
+    run_id = run_number(run, opened.journal.runs(fleet=fleet, limit=1))
+    record = run_of(opened.journal, fleet, run_id)
     if record.command.startswith("robots "):
         raise PlanRefused(
             f"run {run_id} was `{record.command}`", hint="run `meshctl robots rollback` for the previous release"
