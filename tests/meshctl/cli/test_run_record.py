@@ -63,6 +63,23 @@ def test_the_last_run_is_the_latest_of_the_fleet_and_the_lab(tmp_path: Path) -> 
                 run_number(text, ())
 
 
+def test_an_interrupted_rollback_is_repeated_not_undone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    inventory = tmp_path / "fleet.yaml"
+    inventory.write_text(HEAD, encoding="utf-8")
+    with Journal(tmp_path / "meshctl/journal.sqlite") as journal:
+        for command in ("provision", "rollback", "rollback"):
+            run = journal.begin(command, fleet="trial", inventory="inv", nodes=("a",))
+            run.finish_node(Outcome("a", Result.PENDING))
+            run.end("1 pending")
+    with pytest.raises(SystemExit) as ended:
+        main(["rollback", "last", "--yes", "-i", str(inventory)])
+    assert ended.value.code == 2
+    assert "run 1 changed none of these nodes" in capsys.readouterr().err
+
+
 def test_a_run_in_progress_is_not_resumed(tmp_path: Path) -> None:
     with Journal(tmp_path / "journal.sqlite") as journal:
         run = journal.begin("provision", fleet="f", inventory="inv", nodes=("a",))
