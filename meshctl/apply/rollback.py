@@ -6,7 +6,7 @@ order, whole-mesh commits and proofs are those of `meshctl provision`. `irrevers
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -75,13 +75,23 @@ def before_state(plan: NodePlan, desired: DesiredState, observation: Observation
 
 
 def irreversible(
-    run_id: int, node: Node | None, outcome: Outcome, state: EarlierState | None, later_runs: Sequence[int]
+    run_id: int,
+    node: Node | None,
+    outcome: Outcome,
+    state: EarlierState | None,
+    later_runs: Sequence[int],
+    undoing: Collection[int] = (),
 ) -> str:
-    """Why this node cannot be returned to before the run; empty if it can. `later_runs` changed it, oldest first."""
+    """Why this node cannot be returned to before the run; empty if it can.
+
+    `later_runs` changed it, oldest first; those of them that rolled back the run are in `undoing`.
+    """
     if node is None:
         return "the inventory no longer manages it"
     if outcome.result is Result.UNCERTAIN:
         return f"the outcome of run {run_id} is uncertain: run `meshctl resume {run_id}` first"
+    if later_runs and later_runs[-1] in undoing:
+        return f"run {later_runs[-1]} has rolled it back already"
     if later_runs:
         return f"run {later_runs[-1]} changed it later: run `meshctl rollback {later_runs[-1]}` first"
     if state is None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import datetime
 from itertools import islice
@@ -15,6 +16,7 @@ from meshctl.cli.context import AsJson, line_width
 from meshctl.cli.history_follow import concerns, is_pattern
 from meshctl.cli.history_follow import follow as follow_runs
 from meshctl.cli.output import echo, echo_error, echo_json
+from meshctl.cli.run_record import run_number
 from meshctl.errors import InputError
 from meshctl.fleet.journal import Journal, RunRecord
 from meshctl.fleet.journal_store import open_journal
@@ -26,7 +28,9 @@ from meshctl.report.terminal_escapes import clean
 
 
 def history(
-    run: Annotated[int | None, typer.Argument(help="Run number; shows its nodes and steps.")] = None,
+    run: Annotated[
+        str | None, typer.Argument(help="Run number, or `last` for the latest run; shows its nodes and steps.")
+    ] = None,
     node: Annotated[
         str | None, typer.Option("--node", help="Only runs or steps of this node: a name or a pattern.")
     ] = None,
@@ -63,7 +67,8 @@ def history(
         elif run is None:
             _list_runs(journal, run_filter, limit, as_json=as_json)
         else:
-            _show_run(journal, run, node, as_json=as_json, with_diffs=diff)
+            number = run_number(run, _selected_runs(journal, run_filter))
+            _show_run(journal, number, node, as_json=as_json, with_diffs=diff)
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,12 +91,17 @@ class _RunFilter:
         return f"{node}{fleet}{where}"
 
 
-def _list_runs(journal: Journal, run_filter: _RunFilter, limit: int, *, as_json: bool) -> None:
+def _selected_runs(journal: Journal, run_filter: _RunFilter) -> Iterator[RunRecord]:
+    """Newest first."""
     node = run_filter.node
     found = journal.runs(node=None if is_pattern(node) else node, limit=None)
     if is_pattern(node):
         found = tuple(run for run in found if any(concerns(node, outcome.node) for outcome in journal.outcomes(run.id)))
-    records = tuple(islice((record for record in found if run_filter.matches(record)), limit))
+    return (record for record in found if run_filter.matches(record))
+
+
+def _list_runs(journal: Journal, run_filter: _RunFilter, limit: int, *, as_json: bool) -> None:
+    records = tuple(islice(_selected_runs(journal, run_filter), limit))
     if as_json:
         echo_json(json.dumps([_run_object(record) for record in records], indent=1))
         return
@@ -175,7 +185,7 @@ def _show_run(journal: Journal, run_id: int, node: str | None, *, as_json: bool,
             if step.node == outcome.node:
                 took = "interrupted" if step.duration_s is None else f"{step.duration_s:.2f} s"
                 result = "" if step.result == "done" else step.result
-                echo(f"  {step.step:<{width}} {took:>10}  {result}".rstrip())
+                _echo_wrapped(f"  {step.step:<{width}} {took:>10}  {result}".rstrip())
 
 
 def _echo_wrapped(text: str) -> None:

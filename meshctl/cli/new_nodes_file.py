@@ -18,7 +18,9 @@ def file_of_new_nodes(editor: Editor, given: Path | None) -> Path:
     """The inventory's file for new nodes. Raises InputError where that is the operator's choice."""
     files = editor.files()
     if given is not None:
-        found = next((file for file in files if file.resolve() == given.resolve()), None)
+        # as the shell sees it, or, as in `include`, beside the inventory's first file
+        meant = (given.resolve(), (files[0].parent / given).resolve())
+        found = next((file for file in files if file.resolve() in meant), None)
         if found is None:
             listed = ", ".join(map(str, files))
             raise InputError(f"--file {given}: expected a file of the inventory, one of {listed}")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated
 
@@ -25,12 +25,12 @@ from meshctl.cli.context import (
 from meshctl.cli.output import echo
 from meshctl.cli.plan import AcceptCut, Brief, Direct, LeaveBehind, Rate, Together, Yes
 from meshctl.cli.plan_execution import PlanRefused, choices_of, confirm_and_execute, prepare_plan
-from meshctl.cli.run_record import run_of
+from meshctl.cli.run_record import run_number, run_of
 from meshctl.cli.site_files import with_states
 from meshctl.cli.site_runs import RunOptions, change_everywhere, meet, sites_of
 from meshctl.errors import ExitCode, InputError
 from meshctl.fleet import Outcome, Result
-from meshctl.fleet.journal import RunRecord
+from meshctl.fleet.journal import Journal, RunRecord
 from meshctl.fleet.process import runs_here
 from meshctl.fleet.run_files import BEFORE, RunFiles
 
@@ -46,7 +46,7 @@ _REASONS = {
 
 
 def rollback(
-    run: Annotated[int, typer.Argument(help="Run number, from `meshctl history`.")],
+    run: Annotated[str, typer.Argument(help="Run number, or `last`: the fleet's latest run but rollbacks.")],
     nodes: Nodes = None,
     limit: Limit = None,
     inventory: InventoryPath = Path(),
@@ -70,6 +70,7 @@ def rollback(
     """
     with session(inventory, key_files=key or (), lab=lab, changes_nothing=dry_run) as opened:
         record = _record(opened, run)
+        number = record.id
         selected = {node.name for node in selected_nodes(opened.fleet, nodes, limit)} if nodes or limit else None
         # how parts of it ended that were left to their sites
         meet(opened, record, as_json=as_json)
@@ -79,7 +80,7 @@ def rollback(
         own, sites = sites_of(opened, list(states), None, direct=direct)
         try:
             if sites:
-                options = RunOptions("rollback", choices, as_json, rate, undoes=run)
+                options = RunOptions("rollback", choices, as_json, rate, undoes=number)
                 raise change_everywhere(opened, inventory, own, sites, options, yes=yes, brief=brief, dry_run=dry_run)
             prepared = prepare_plan(opened, own, choices, reconnects=not dry_run)
             confirm_and_execute(
@@ -92,18 +93,22 @@ def rollback(
                 brief=brief,
                 rate=rate,
                 dry_run=dry_run,
-                undoes=run,
+                undoes=number,
             )
         except typer.Exit as ended:
             if ended.exit_code == ExitCode.OK and not dry_run:
-                text = f"the inventory still describes run {run}: revert it, or the next `meshctl provision` applies it"
+                text = (
+                    f"the inventory still describes run {number}: revert it, or the next `meshctl provision` applies it"
+                )
                 echo(text, err=True)
             raise
 
 
-def _record(opened: Session, run_id: int) -> RunRecord:
+def _record(opened: Session, run: str) -> RunRecord:
     """The run. Raises InputError for none of this fleet, PlanRefused for one that no plan takes back."""
-    record = run_of(opened.journal, opened.fleet.name, run_id)
+    fleet = opened.fleet.name
+    run_id = run_number(run, _latest(opened.journal, fleet))
+    record = run_of(opened.journal, fleet, run_id)
     if record.command.startswith("robots "):
         raise PlanRefused(
             f"run {run_id} was `{record.command}`", hint="run `meshctl robots rollback` for the previous release"
@@ -113,6 +118,11 @@ def _record(opened: Session, run_id: int) -> RunRecord:
             f"run {run_id} was a {record.command} and cannot be rolled back: {_REASONS.get(record.command, '')}"
         )
     return record
+
+
+def _latest(journal: Journal, fleet: str) -> Iterator[RunRecord]:
+    """Newest first, without rollbacks: an interrupted one that is repeated must not be undone instead."""
+    return (each for each in journal.runs(fleet=fleet, limit=None) if each.command != "rollback")
 
 
 def _states(
@@ -126,7 +136,7 @@ def _states(
             hint=f"run `meshctl rollback {record.id}` there",
         )
     saved = saved or {}
-    later = _later_runs(opened, record)
+    later, undoing = _later_runs(opened, record)
     states: dict[str, EarlierState] = {}
     refused: dict[str, str] = {}
     for outcome in _changed_outcomes(opened, record.id, selected):
@@ -134,7 +144,7 @@ def _states(
         state = EarlierState.from_json(saved[name]) if name in saved else None
         node = opened.fleet.nodes.get(name)
         managed = node if node is not None and node.state.is_managed else None
-        if why := irreversible(record.id, managed, outcome, state, later.get(name, ())):
+        if why := irreversible(record.id, managed, outcome, state, later.get(name, ()), undoing):
             refused[name] = why
         elif state is not None:
             states[name] = state
@@ -157,15 +167,18 @@ def _changed_outcomes(opened: Session, run_id: int, selected: set[str] | None) -
     ]
 
 
-def _later_runs(opened: Session, record: RunRecord) -> dict[str, tuple[int, ...]]:
-    """Node -> the later runs that changed it and are not undone, oldest first."""
+def _later_runs(opened: Session, record: RunRecord) -> tuple[dict[str, tuple[int, ...]], frozenset[int]]:
+    """Node -> the later runs that changed it and are not undone, oldest first; and those that undid `record`."""
+    undoing: set[int] = set()
     later: dict[str, list[tuple[int, int | None]]] = {}
     for each in reversed(opened.journal.runs(fleet=opened.fleet.name, limit=None)):
         if each.id <= record.id or each.command.startswith("robots "):
             continue
         undone = json.loads(each.plan).get("undoes") if each.plan else None
+        if undone == record.id:
+            undoing.add(each.id)
         for outcome in opened.journal.outcomes(each.id):
             if outcome.result in (Result.DONE, Result.UNCERTAIN):
                 later.setdefault(outcome.node, []).append((each.id, undone))
     # the rollback of this very run leaves nothing to take back, so it counts
-    return {name: without_undone(runs) for name, runs in later.items()}
+    return {name: without_undone(runs) for name, runs in later.items()}, frozenset(undoing)

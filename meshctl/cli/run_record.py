@@ -1,9 +1,29 @@
-"""The run that an operator named by its number in `meshctl history`, checked before it is resumed or rolled back."""
+"""The run that an operator named, by its number or as the last one, checked before it is resumed or rolled back."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from meshctl.errors import InputError
 from meshctl.fleet.journal import Journal, RunRecord
+
+LAST = "last"
+# SQLite's integers have 64 bits
+_MAX_DIGITS = 18
+
+
+def run_number(text: str, latest: Iterable[RunRecord]) -> int:
+    """The number of the run that `text` names; `last` names the first of `latest`. Raises InputError for other text."""
+    if text == LAST:
+        newest = next(iter(latest), None)
+        if newest is None:
+            raise InputError("there is no run yet", hint="run `meshctl history` to list all runs")
+        return newest.id
+    if not (text.isascii() and text.isdigit() and len(text) <= _MAX_DIGITS):
+        raise InputError(
+            f"expected the number of a run, or `{LAST}`, found {text}", hint="`meshctl history` lists all runs"
+        )
+    return int(text)
 
 
 def run_of(journal: Journal, fleet: str, number: int) -> RunRecord:
@@ -15,7 +35,8 @@ def run_of(journal: Journal, fleet: str, number: int) -> RunRecord:
     if record is None:
         raise InputError(f"run {number} does not exist", hint="run `meshctl history` to list all runs")
     if record.fleet != fleet:
-        raise InputError(f"run {number} belongs to fleet {record.fleet}, not to {fleet}")
+        hint = f"`meshctl history --fleet {fleet}` lists the runs of {fleet}"
+        raise InputError(f"run {number} belongs to fleet {record.fleet}, not to {fleet}", hint=hint)
     if record.lab and record.lab != journal.lab:
         raise InputError(f"run {number} belongs to the lab in {record.lab}", hint=f"add `--lab {record.lab}`")
     if journal.lab and not record.lab:

@@ -69,7 +69,8 @@ def _by_section(lines: Iterable[str]) -> Iterator[str]:
     yield from (_named(section, what) for section, what in whole.items())
     for key in dict.fromkeys((*old, *new)):
         section, name = key
-        if section not in whole:
+        # an option that only moved, because another order of options is rendered, has not changed
+        if section not in whole and old.get(key) != new.get(key):
             yield _named(section, f"{name} {_change(old.get(key, []), new.get(key, []))}")
 
 

@@ -1,4 +1,4 @@
-"""Login: operators' keys, host keys, passwords (MC421 to MC434)."""
+"""Login: operators' keys, host keys, passwords (MC421 to MC435)."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from meshctl.inventory.file_paths import file_path, known_hosts_path
 from meshctl.lint.context import LintContext
 from meshctl.lint.grouping import duplicates
 from meshctl.lint.rule import Example, Finding, fleet_rule
+from meshctl.lint.rules.addresses import is_host
 from meshctl.lint.rules.secrets import logins
 from meshctl.lint.sshkey import AuthorizedKey, BadKey, parse_authorized_key
 from meshctl.model import Fleet
@@ -319,6 +320,23 @@ def host_with_user_or_port(fleet: Fleet, _context: LintContext) -> Iterator[Find
         user, at, host = ssh.user.rpartition("@")
         if at:
             yield Finding((*place, "user"), "not a user's name alone", f"user: {user}, host: {host}", ssh.user)
+
+
+@fleet_rule(
+    "MC435",
+    Severity.ERROR,
+    "An SSH host is neither an address nor a host name",
+    why="No name server knows such a name, so no login reaches the device.",
+    fix="Write the name or the address alone, without blanks, underscores or quotes.",
+    failing="robots: {husky1: {computer: {ssh: {host: husky 1}}}}",
+    passing="robots: {husky1: {computer: {ssh: {host: husky-1}}}}",
+    is_fallback=True,
+)
+def not_an_ssh_host(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for place, ssh in logins(fleet):
+        # an IPv6 address may have a zone here
+        if ssh.host and not is_host(ssh.host.partition("%")[0]):
+            yield Finding((*place, "host"), "not a host", "an address such as 10.42.0.110, or a host name", ssh.host)
 
 
 def _is_public_key(text: str) -> bool:

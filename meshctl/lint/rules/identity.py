@@ -1,4 +1,4 @@
-"""Unique identifiers of nodes: hostnames, MAC addresses, host keys, labels, serial numbers (MC110 to MC121)."""
+"""Unique identifiers of nodes: hostnames, MAC addresses, host keys, labels, serial numbers (MC110 to MC122)."""
 
 from __future__ import annotations
 
@@ -200,7 +200,8 @@ def _host_keys(fleet: Fleet, context: LintContext) -> Iterator[tuple[str, str]]:
     passing="nodes: {base: {label: BASE}, b01: {label: B1}}",
 )
 def label_twice(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    marks = ((node.label, ("nodes", node.name, "label")) for node in fleet.managed() if node.label)
+    # a person, and a table's row, do not tell b1 from B1
+    marks = ((node.label.casefold(), ("nodes", node.name, "label")) for node in fleet.managed() if node.label)
     yield from _collisions(fleet, marks, "label")
 
 
@@ -329,3 +330,22 @@ def robot_name_invalid(fleet: Fleet, _context: LintContext) -> Iterator[Finding]
             yield Finding(
                 ("robots", name), "not a valid peer name", "a letter, then letters, digits, - and _, at most 63", name
             )
+
+
+@fleet_rule(
+    "MC122",
+    Severity.WARNING,
+    "A label is the name of another device",
+    why="""Commands look for a name before a label: `meshctl deployed b02`, typed from the box in hand, marks the other
+    node.""",
+    fix="Use the node's own name as its label, or a label that no device has as its name.",
+    failing="nodes: {base: {label: b01}}",
+    passing="nodes: {b01: {label: b01}}",
+)
+def label_of_other(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    names = {name.casefold(): name for name in (*fleet.robots, *fleet.nodes)}
+    for node in fleet.managed():
+        other = names.get(node.label.casefold(), node.name) if node.label else node.name
+        if other != node.name and other != node.robot:
+            path = ("nodes", node.name, "label")
+            yield Finding(path, f"{other} has it as its name", "a label that is no other device's name", node.label)

@@ -1,4 +1,4 @@
-"""Sites: nodes, their meshes and the worker that provisions them (MC131 to MC138)."""
+"""Sites: nodes, their meshes and the worker that provisions them (MC131 to MC139)."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
 from meshctl.lint.grouping import group_by_key
 from meshctl.lint.rule import Finding, fleet_rule
+from meshctl.lint.rules.addresses import as_address
 from meshctl.lint.rules.references import suggest
 from meshctl.lint.sshkey import BadKey, parse_authorized_key
 from meshctl.model import Fleet, Node, Role
@@ -218,3 +219,28 @@ def _joined_meshes(fleet: Fleet, base: Node) -> set[str]:
     while new := {mesh for group in groups if group & reached for mesh in group} - reached:
         reached |= new
     return reached
+
+
+@fleet_rule(
+    "MC139",
+    Severity.ERROR,
+    "A site's gateway is a radio",
+    why="""The gateway is the computer that runs the site's worker, which needs Python. A radio runs OpenWrt, which has
+    none.""",
+    fix="Set `ssh.host` to the computer at the site.",
+    failing=f"""
+    sites: {{north: {{ssh: {{host: 10.42.0.1}}, worker_key: {_KEY}}}}}
+    defaults: {{site: north}}
+    """,
+    passing=f"""
+    sites: {{north: {{ssh: {{host: 10.42.0.100}}, worker_key: {_KEY}}}}}
+    defaults: {{site: north}}
+    """,
+)
+def gateway_is_radio(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    radios = {as_address(str(node.address.ip)): node.name for node in fleet.managed()}
+    for site in fleet.sites.values():
+        radio = radios.get(as_address(site.ssh.host))
+        if radio is not None:
+            path = ("sites", site.name, "ssh", "host")
+            yield Finding(path, f"{radio} is a radio", "the computer at the site", site.ssh.host)

@@ -1,4 +1,4 @@
-"""OpenWrt's system settings: clocks, time zones, logs (MC231 to MC237)."""
+"""OpenWrt's system settings: clocks, time zones, logs (MC231 to MC239)."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from meshctl.lint.context import LintContext
 from meshctl.lint.rule import Finding, fleet_rule
 from meshctl.lint.rules.addresses import as_address, is_host, networks, stations
 from meshctl.lint.rules.references import suggest
-from meshctl.lint.zones import is_posix, posix_of, same_clock, zones
+from meshctl.lint.zones import countries_of, is_posix, posix_of, same_clock, standard_offset_s, zones, zones_of
 from meshctl.model import Fleet, Node
 from meshctl.model.ip import IpAddress
-from meshctl.wording import counted
+from meshctl.wording import counted, one_of
 
 
 @fleet_rule(
@@ -142,7 +142,7 @@ _OFFSET_OF_UTC = re.compile(r"(UTC|GMT)(?P<sign>[+-]?)0*(?P<hours>\d+)")
     Elsewhere UTC+2 is two hours ahead, so one of its readers is wrong.""",
     fix="Write the offset as the zone's name, too: `<+02>-2` is two hours ahead of UTC, `<-05>5` five hours behind.",
     failing="system: {timezone: UTC+2}",
-    passing="system: {timezone: '<+02>-2'}",
+    passing="system: {timezone: '<-05>5'}",
 )
 def offset_of_utc(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     written = fleet.system.timezone
@@ -171,3 +171,56 @@ def server_without_a_name(fleet: Fleet, _context: LintContext) -> Iterator[Findi
     for path, host in (*hosts, *servers):
         if not is_host(host):
             yield Finding(path, "not a host", "an address such as 10.42.0.100, or a host name", host)
+
+
+@fleet_rule(
+    "MC238",
+    Severity.WARNING,
+    "The country and the time zone do not match",
+    why="""The country decides which channels and powers the radios may use. If it was left over from another fleet,
+    the radios break the rules of the place where they are, and lint checks them against the wrong ones.""",
+    fix="Set `country` to where the radios are used, or correct `timezone` and `zonename`.",
+    failing="system: {timezone: 'CET-1CEST,M3.5.0,M10.5.0/3', zonename: Europe/Oslo}",
+    passing="system: {timezone: 'MST7MDT,M3.2.0,M11.1.0', zonename: America/Denver}",
+)
+def country_of_other_zone(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    system = fleet.system
+    countries = countries_of(system.zonename)
+    if countries:
+        if fleet.country not in countries:
+            yield Finding(("country",), f"{system.zonename} is not in this country", one_of(countries), fleet.country)
+        return
+    if _OFFSET_OF_UTC.fullmatch(system.timezone):
+        # MC236: in the other direction it may match
+        return
+    offset_s = standard_offset_s(system.timezone)
+    own = {standard_offset_s(zones()[name]) for name in zones_of(fleet.country)}
+    # clocks in UTC are common everywhere; MC231 reports what is no POSIX time zone
+    if offset_s and own and offset_s not in own and is_posix(system.timezone):
+        message = f"no time zone of this country matches {system.timezone}"
+        yield Finding(("country",), message, "the country where the radios are used", fleet.country)
+
+
+# logd allocates the whole log at its start, beside everything else that a node keeps in memory
+_MAX_LOG_SHARE = 1 / 8
+
+
+@fleet_rule(
+    "MC239",
+    Severity.WARNING,
+    "The log takes much of a node's memory",
+    why="""logd keeps the log in RAM. If too little is left, the kernel ends processes, and a change or a flash, which
+    are unpacked in RAM, fails.""",
+    fix="Set `log_size_kib` in KiB: 64 to 1024 are usual. A `log_host` keeps everything.",
+    failing="system: {log_size_kib: 65536}",
+    passing="system: {log_size_kib: 1024}",
+)
+def log_fills_memory(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    smallest = min((node.hardware for node in fleet.managed()), key=lambda profile: profile.memory_mib, default=None)
+    if smallest is None:
+        return
+    most_kib = int(smallest.memory_mib * 1024 * _MAX_LOG_SHARE)
+    if fleet.system.log_size_kib > most_kib:
+        message = f"{smallest.name} has {smallest.memory_mib} MiB of memory"
+        found = f"{fleet.system.log_size_kib} ({fleet.system.log_size_kib / 1024:g} MiB)"
+        yield Finding(("system", "log_size_kib"), message, f"at most {most_kib} (one eighth)", found)

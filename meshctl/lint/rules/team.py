@@ -273,7 +273,7 @@ def robot_without_radio(fleet: Fleet, _context: LintContext) -> Iterator[Finding
     "A node's role and its robot do not match",
     why="""A node with `role: robot` moves together with everything behind it. Without its robot, lint cannot detect
     loops, and plans cannot determine what a change disconnects. A radio that a robot has under `nodes`, but with the
-    role of a beacon (the default), is counted and marked as one.""",
+    role of a beacon (the default), is counted and marked as one. Hops are counted, and plans start, from a base.""",
     fix="List a robot's radio under its `nodes`, with `role: robot`; list beacons under `carries`.",
     failing="nodes: {stray: {role: robot, address: 10.42.0.77}}",
     passing="""
@@ -283,6 +283,7 @@ def robot_without_radio(fleet: Fleet, _context: LintContext) -> Iterator[Finding
 )
 def role_without_robot(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     mounted_on = {name: robot.name for robot in fleet.robots.values() for name in robot.nodes}
+    stations = [robot.name for robot in fleet.robots.values() if robot.is_base]
     for node in fleet.managed():
         if node.role is Role.ROBOT and not node.robot and fleet.robots:
             yield Finding(("nodes", node.name), "belongs to no robot", "a robot that lists it", "none")
@@ -290,6 +291,9 @@ def role_without_robot(fleet: Fleet, _context: LintContext) -> Iterator[Finding]
             path = first_written(fleet, ("nodes", node.name, "role"), ("nodes", node.name))
             message = f"{mounted_on[node.name]} lists it as its radio"
             yield Finding(path, message, "role: robot, or base for the base station", node.role.value)
+        elif node.role is Role.BASE and stations and mounted_on.get(node.name, stations[0]) not in stations:
+            message = f"it is a radio of {mounted_on[node.name]}, which is not the base station"
+            yield Finding(("nodes", node.name, "role"), message, "role: robot", node.role.value)
 
 
 @fleet_rule(

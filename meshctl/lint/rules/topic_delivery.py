@@ -1,4 +1,4 @@
-"""Topics: delivery, names, differences, subscriptions (MC712 to MC726)."""
+"""Topics: delivery, names, differences, subscriptions (MC712 to MC728)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from meshctl.lint.rule import Finding, fleet_rule
 from meshctl.model import Fleet, Outbox, Topic, TopicClass
 from meshctl.resolve import has_routed_lans
 from meshctl.suggest import nearest, suggestion
-from meshctl.wording import counted
+from meshctl.wording import counted, join_limited
 
 _ALL = "all"
 # at 5 % loss 0.95**32, one in five, of such best-effort messages arrive
@@ -39,6 +39,10 @@ _COMPRESSED_TYPES = frozenset(
         "point_cloud_interfaces/CompressedPointCloud2",
     }
 )
+
+
+# a frame that is retransmitted a few times, and its queue, on one link
+_MIN_DEADLINE_S = 0.02
 
 
 def _path(topic: Topic, *key: str) -> tuple[str, ...]:
@@ -281,3 +285,39 @@ def type_unknown(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
             near = [f"{other}/{rest}" for other in packages]
             message = f"{package} is no package of ROS"
             yield Finding(_path(topic, "type"), message, " or ".join(near), topic.type_name, suggestion(near))
+
+
+@fleet_rule(
+    "MC727",
+    Severity.WARNING,
+    "The base station cannot send the emergency stop",
+    why="""The operator at the base station presses the stop, but the topic is bridged from other robots only: nothing
+    is sent.""",
+    fix="Add the base station to `sources`.",
+    failing="topics: {estop: {sources: [husky1]}}",
+    passing="topics: {estop: {sources: [base-station]}}",
+)
+def stop_not_from_base(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    bases = [name for name, robot in fleet.robots.items() if robot.is_base]
+    stops = [topic for topic in fleet.topics if topic.topic_class is TopicClass.EMERGENCY_STOP]
+    if not bases or not stops or any(not topic.sources or set(bases) & set(topic.sources) for topic in stops):
+        return
+    found = join_limited(stops[0].sources)
+    yield Finding(_path(stops[0], "sources"), f"{bases[0]} cannot stop the robots", bases[0], found)
+
+
+@fleet_rule(
+    "MC728",
+    Severity.WARNING,
+    "A topic's deadline is shorter than a link needs",
+    why="""A message that waits behind one other, or whose frame is retransmitted, is dropped by its sender: most of the
+    topic's messages never arrive, and no error is reported.""",
+    fix="Set `deadline_s` in seconds: 2 for two seconds.",
+    failing="topics: {video: {deadline_s: 0.002}}",
+    passing="topics: {video: {deadline_s: 2}}",
+)
+def deadline_too_short(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for topic in fleet.topics:
+        if topic.deadline_s is not None and topic.deadline_s < _MIN_DEADLINE_S:
+            expected = f"at least {_MIN_DEADLINE_S:g} s"
+            yield Finding(_path(topic, "deadline_s"), "expires while it is sent", expected, f"{topic.deadline_s:g} s")

@@ -173,7 +173,7 @@ def stop_best_effort(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     "The emergency stop does not reach every robot",
     why="A robot that is missing from `destinations` does not stop with the others.",
     fix="Set `destinations: [all]`.",
-    failing="topics: {estop: {sources: [husky1], destinations: [base-station]}}",
+    failing="topics: {estop: {sources: [base-station, husky1], destinations: [base-station]}}",
     passing="topics: {estop: {destinations: [all]}}",
 )
 def stop_not_for_all(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:

@@ -1,4 +1,4 @@
-"""Load, ports and timers of the transport (MC731 to MC741)."""
+"""Load, ports and timers of the transport (MC731 to MC742)."""
 
 from __future__ import annotations
 
@@ -40,6 +40,9 @@ _KNOWN_PORTS = {
 }
 _UDP_PORTS = frozenset({53, 67, 68, 123, 514, 5353, 7400, 7447})
 _TCP_PORTS = frozenset({22, 53, 7447, 11311})
+_SYSLOG_PORT = 514
+# the kernel's default net.ipv4.ip_local_port_range
+_EPHEMERAL_PORTS = range(32_768, 61_000)
 
 
 @dataclass(frozen=True, slots=True)
@@ -230,10 +233,10 @@ def port_taken(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
 @fleet_rule(
     "MC737",
     Severity.ERROR,
-    "The log host's port is the transport's port",
-    why="""Logs arrive at the daemon's port on the base station's computer, as both use UDP: log lines are counted as
+    "The log host's port is used by another service",
+    why="""Logs are sent by UDP. They arrive at the service that has the port: at the daemon, log lines are counted as
     forged datagrams, and no log is kept.""",
-    fix="Use different ports.",
+    fix="Use the log server's port, usually 514, and another one for the transport.",
     failing="""
     udp_mesh: {port: 5140}
     system: {log_host: 10.42.0.100, log_port: 5140}
@@ -244,6 +247,9 @@ def port_taken(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     """,
 )
 def log_port_shared(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    port = fleet.system.log_port
+    if fleet.system.log_host and port in _UDP_PORTS and port != _SYSLOG_PORT:
+        yield Finding(("system", "log_port"), f"used by {_KNOWN_PORTS[port]}", "the log server's port", str(port))
     hosts = {robot.computer.address.ip for robot in fleet.robots.values() if robot.computer is not None}
     if as_address(fleet.system.log_host) in hosts and fleet.system.log_port == fleet.udp_mesh.port:
         path = first_written(fleet, ("system", "log_port"), ("udp_mesh", "port"))
@@ -319,7 +325,7 @@ def offline_too_late(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
 @fleet_rule(
     "MC741",
     Severity.WARNING,
-    "The transport's port is in the ephemeral range",
+    "A port of the transport is in the ephemeral range",
     why="""Linux assigns ports from 32768 on to any program that requests one: occasionally this port is taken before
     udp_mesh starts.""",
     fix="Use a port from 1024 to 32767, such as 8700.",
@@ -327,7 +333,27 @@ def offline_too_late(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     passing="udp_mesh: {port: 8700}",
 )
 def port_ephemeral(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    # the kernel's default net.ipv4.ip_local_port_range
-    if 32_768 <= fleet.udp_mesh.port <= 60_999:
-        found = str(fleet.udp_mesh.port)
-        yield Finding(("udp_mesh", "port"), "may be in use at boot", "1024 to 32767", found)
+    for key, port in (("port", fleet.udp_mesh.port), ("metrics_port", fleet.udp_mesh.metrics_port)):
+        if port in _EPHEMERAL_PORTS:
+            yield Finding(("udp_mesh", key), "may be in use at boot", "1024 to 32767", str(port))
+
+
+# ten a second notice a lost peer within a second, even if most are lost
+_MIN_HEARTBEAT_S = 0.1
+
+
+@fleet_rule(
+    "MC742",
+    Severity.WARNING,
+    "Heartbeats are sent too often",
+    why="""Each robot broadcasts its heartbeats at the multicast rate, and every node of the mesh repeats them: they
+    take the airtime of the topics.""",
+    fix="Set `heartbeat_s` in seconds; 1 is usual, 0.5 for robots that move fast.",
+    failing="udp_mesh: {heartbeat_s: 0.001}",
+    passing="udp_mesh: {heartbeat_s: 1}",
+)
+def heartbeat_too_often(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    interval_s = fleet.udp_mesh.heartbeat_s
+    if interval_s < _MIN_HEARTBEAT_S:
+        message = f"{1 / interval_s:.0f} broadcasts a second from each robot"
+        yield Finding(("udp_mesh", "heartbeat_s"), message, f"at least {_MIN_HEARTBEAT_S:g} s", f"{interval_s:g} s")

@@ -76,6 +76,13 @@ def test_an_irreversible_run_is_rejected(
     assert refusal(state, outcome, later).startswith(why)
 
 
+def test_a_run_that_was_rolled_back_is_not_rolled_forward() -> None:
+    node = fleet().nodes["b01"]
+    assert irreversible(7, node, DONE, recorded(), (8,), {8}) == "run 8 has rolled it back already"
+    # a change after that
+    assert "run `meshctl rollback 9` first" in irreversible(7, node, DONE, recorded(), (8, 9), {8})
+
+
 def test_a_node_without_a_record_or_unmanaged_is_refused() -> None:
     assert "not recorded" in irreversible(7, fleet().nodes["b01"], DONE, None, ())
     assert "no longer manages" in irreversible(7, None, DONE, recorded(), ())

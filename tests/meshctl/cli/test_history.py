@@ -9,6 +9,7 @@ import pytest
 
 from meshctl.cli.journaled_run import retry_command
 from meshctl.cli.main import main
+from meshctl.errors import InputError
 from meshctl.fleet import Outcome, Result
 from meshctl.fleet.journal import Journal
 
@@ -46,6 +47,8 @@ def test_a_run_is_wrapped_at_the_width_of_the_terminal(
     with Journal(tmp_path / "meshctl" / "journal.sqlite") as journal:
         run = journal.begin("provision", fleet="mine", inventory="/x", nodes=("b01",))
         reason = "unreachable at its new address, so that it returned to its previous state by itself"
+        with pytest.raises(InputError, match="reset"), run.step("b01", "apply"):
+            raise InputError("b01 ([127.42.0.103]:20023): connection reset by peer during a command")
         run.finish_node(Outcome("b01", Result.ROLLED_BACK, reason))
         run.end("1 rolled back")
     monkeypatch.setenv("COLUMNS", "40")
@@ -54,6 +57,14 @@ def test_a_run_is_wrapped_at_the_width_of_the_terminal(
     assert max(map(len, narrow)) <= 40
     monkeypatch.delenv("COLUMNS")
     assert f"b01: rolled back: {reason}" in said(capfd, "1").splitlines()
+
+
+@pytest.mark.usefixtures("journal")
+def test_the_last_run_is_the_first_of_those_that_are_listed(capfd: pytest.CaptureFixture[str]) -> None:
+    assert said(capfd, "last").startswith("run 4: provision of mine ")
+    assert said(capfd, "last", "--fleet", "ruins").startswith("run 3: ")
+    assert said(capfd, "last", "--virtual").startswith("run 2: provision of mine (lab) ")
+    assert json.loads(said(capfd, "last", "--json"))["run"] == 4
 
 
 @pytest.mark.usefixtures("journal")

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from meshctl.cli.main import main
-from meshctl.cli.run_record import run_of
+from meshctl.cli.run_record import run_number, run_of
 from meshctl.errors import InputError
 from meshctl.fleet import Outcome, Result
 from meshctl.fleet.journal import Journal
@@ -25,7 +25,7 @@ from tests.meshctl.inventory.inventories import HEAD
         ),
         (("f", "/lab"), ("f", ""), "belongs to the lab in /lab", "add `--lab /lab`"),
         (("f", "/lab"), ("f", "/other"), "belongs to the lab in /lab", "add `--lab /lab`"),
-        (("g", ""), ("f", ""), "belongs to fleet g, not to f", ""),
+        (("g", ""), ("f", ""), "belongs to fleet g, not to f", "history --fleet f"),
     ],
 )
 def test_a_run_of_another_fleet_is_refused_by_its_fleet(
@@ -44,6 +44,40 @@ def test_a_run_of_another_fleet_is_refused_by_its_fleet(
             run_of(journal, asked_by[0], run.id + 1)
     with Journal(path, lab=of[1]) as journal:
         assert run_of(journal, of[0], run.id).id == run.id
+
+
+def test_the_last_run_is_the_latest_of_the_fleet_and_the_lab(tmp_path: Path) -> None:
+    path = tmp_path / "journal.sqlite"
+    with Journal(path) as field, Journal(path, lab="/lab") as lab:
+        runs = [
+            journal.begin("provision", fleet=fleet, inventory="inv", nodes=("a",))
+            for journal, fleet in ((field, "f"), (lab, "f"), (field, "g"))
+        ]
+        assert run_number("last", field.runs(fleet="f", limit=1)) == runs[0].id
+        assert run_number("last", lab.runs(fleet="f", limit=1)) == runs[1].id
+        assert run_number("17", field.runs(fleet="f", limit=1)) == 17
+        with pytest.raises(InputError, match="there is no run yet"):
+            run_number("last", field.runs(fleet="h", limit=1))
+        for text in ("b03", "-1", "1.5", "", "\u0661", "9" * 30):
+            with pytest.raises(InputError, match="expected the number of a run, or `last`"):
+                run_number(text, ())
+
+
+def test_an_interrupted_rollback_is_repeated_not_undone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    inventory = tmp_path / "fleet.yaml"
+    inventory.write_text(HEAD, encoding="utf-8")
+    with Journal(tmp_path / "meshctl/journal.sqlite") as journal:
+        for command in ("provision", "rollback", "rollback"):
+            run = journal.begin(command, fleet="trial", inventory="inv", nodes=("a",))
+            run.finish_node(Outcome("a", Result.PENDING))
+            run.end("1 pending")
+    with pytest.raises(SystemExit) as ended:
+        main(["rollback", "last", "--yes", "-i", str(inventory)])
+    assert ended.value.code == 2
+    assert "run 1 changed none of these nodes" in capsys.readouterr().err
 
 
 def test_a_run_in_progress_is_not_resumed(tmp_path: Path) -> None:

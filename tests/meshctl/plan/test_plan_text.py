@@ -161,6 +161,12 @@ def test_settings_are_named_with_their_section_and_both_values() -> None:
         "proto removed (was none)",
         "lan: mtu set to 1532",
     )
+    # another order of options
+    moved = (
+        "@@ -1,3 +1,3 @@\n config wifi-device 'radio0'\n"
+        "-\toption band '2g'\n-\toption channel '1'\n+\toption channel '6'\n+\toption band '2g'\n"
+    )
+    assert settings(FileChange("etc/config/wireless", "changed", HEAD + moved)) == ("radio0: channel 1 -> 6",)
     assert settings(FileChange("etc/x", "changed", "mode 0644 -> 0600\n")) == ("mode 0644 -> 0600",)
     assert settings(FileChange("etc/x", "added", HEAD + "+a\n")) == ()
     assert settings(FileChange("etc/x", "changed", HEAD + "-a\n+b\n")) == ("2 lines",)

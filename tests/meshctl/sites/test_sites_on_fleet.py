@@ -239,7 +239,7 @@ def test_a_run_at_sites_is_rolled_back_by_their_workers(rig: SitesRig) -> None:
         assert _files_with_secrets(rig.site_directory(site)) == []
     again = rig.run("rollback", run, "--yes")
     assert again.code == 1
-    assert "changed it later" in again.err
+    assert "has rolled it back already" in again.err
     rig.change_power()
     assert rig.run("provision", "--check").code == 0
 
