@@ -8,7 +8,6 @@ that (`connect`, `observe_and_decide`), and `confirm` or `abort` ends the change
 from __future__ import annotations
 
 import math
-import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -23,6 +22,7 @@ from meshctl.device import deadman
 from meshctl.device.connection import Deadlines, Endpoint
 from meshctl.device.deadman import Change, Payload
 from meshctl.device.errors import AuthenticationRefused, CommandFailed, NodeRefused
+from meshctl.device.liveness import deadline
 from meshctl.device.observation import ChangeStatus, Observation
 from meshctl.device.observe import observe
 from meshctl.device.openwrt import is_first_boot
@@ -249,15 +249,12 @@ def start(
     change.listener.started()
     change.started_s = time.monotonic() if due_s is None else due_s
     change.is_reloaded = False
-    patience = threading.Timer(min(APPLY_ANSWER_TIMEOUT_S, change.window_s / 4), connection.close)
-    patience.daemon = True
-    patience.start()
     in_s = None if at_uptime_s is not None else APPLY_DELAY_S
-    try:
-        with change.ctx.step("apply"):
-            deadman.apply(connection, change.ctx.run.owner, change.id, in_s=in_s, at_uptime_s=at_uptime_s)
-    finally:
-        patience.cancel()
+    with (
+        deadline(min(APPLY_ANSWER_TIMEOUT_S, change.window_s / 4), connection.close),
+        change.ctx.step("apply"),
+    ):
+        deadman.apply(connection, change.ctx.run.owner, change.id, in_s=in_s, at_uptime_s=at_uptime_s)
 
 
 def connect(change: ChangeInProgress) -> SshConnection | None:
