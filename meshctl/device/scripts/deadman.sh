@@ -616,10 +616,13 @@ reload() { # SCRIPT_TEXT [UPTIME_S]: in the background, so that no hanging reloa
 		echo $? >"$RUN/reloaded"
 	) &
 	reload_pid=$!
+	echo $reload_pid 2>/dev/null >"$RUN/reload.waits"
 }
 
 # Two of reload_config at once take each other's list of sums away, and then tell no service of what changed.
+# The one under way may have been begun by a timer that was killed since.
 end_reload() {
+	[ -n "$reload_pid" ] || ! alive "$RUN/reload.waits" || reload_pid=$pid
 	[ -n "$reload_pid" ] || return 0
 	now
 	limit=$((NOW + RELOAD_TURN_CS))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import signal
 import subprocess
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -15,7 +16,7 @@ from meshctl.device.deadman import bundle
 from tests.meshctl.device.changes import NONCE, NONCE_HASH, OWNER, change, is_after, prepare
 from tests.meshctl.device.sandbox import Sandbox
 from tests.meshctl.device.servers import eventually
-from tests.meshctl.device.test_deadman import LONG, armed, last, state, uptime_s
+from tests.meshctl.device.test_deadman import LONG, applied, armed, last, state, uptime_s
 
 # a sync that takes until the test lets it end
 SLOW_SYNC = """#!/bin/sh
@@ -57,6 +58,28 @@ def test_the_second_timer_leaves_a_change_alone_whose_files_take_longer_to_move(
         guard.result(60)
     assert last(node) == ("c1", "confirmed", "operator")
     assert is_after(node.path("/etc"))
+
+
+# reloads for as long as the new files are there, unless it is stopped
+ENDLESS = """echo $$ >>/harness/reloads
+while grep -q 10.42.0.13 /etc/config/network; do usleep 50000; done
+sleep 600
+"""
+
+
+def test_a_reload_whose_timer_was_killed_is_stopped_before_the_restored_files_are_reloaded(node: Sandbox) -> None:
+    """Otherwise both run, and the end of the first one counts as that of the second one."""
+    applied(node, wanted=change(reload=ENDLESS))
+    eventually(lambda: bool(node.text("/harness/reloads")))
+    (watch,) = (int(text) for text in (node.text("/tmp/meshctl/change-c1/watch.pid") or "").split())
+    os.kill(watch, signal.SIGKILL)
+    eventually(lambda: state(node) == "orphaned")
+    node.deadman("abort", OWNER, "c1")
+    eventually(lambda: len((node.text("/harness/reloads") or "").split()) == 2)
+    first, second = (int(text) for text in (node.text("/harness/reloads") or "").split())
+    running = node.processes()
+    assert (first in running, second in running) == (False, True)
+    assert last(node) == ("c1", "restored", "abort")
 
 
 def test_a_lock_that_expires_while_the_bundle_arrives_is_renewed(node: Sandbox) -> None:
