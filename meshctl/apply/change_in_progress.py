@@ -7,14 +7,14 @@ that (`connect`, `observe_and_decide`), and `confirm` or `abort` ends the change
 
 from __future__ import annotations
 
-import threading
+import math
 import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
 from meshctl.apply.change_listener import ChangeListener
-from meshctl.apply.change_set import change_of, new_change_id, new_nonce, services_of
+from meshctl.apply.change_set import change_of, new_change_id, new_nonce, radios_of, services_of
 from meshctl.apply.context import NodeContext
 from meshctl.apply.health_checks import RELOADING, unmet
 from meshctl.apply.next_action import Action, applied_age_s, next_action
@@ -22,6 +22,7 @@ from meshctl.device import deadman
 from meshctl.device.connection import Deadlines, Endpoint
 from meshctl.device.deadman import Change, Payload
 from meshctl.device.errors import AuthenticationRefused, CommandFailed, NodeRefused
+from meshctl.device.liveness import deadline
 from meshctl.device.observation import ChangeStatus, Observation
 from meshctl.device.observe import observe
 from meshctl.device.openwrt import is_first_boot
@@ -33,8 +34,8 @@ from meshctl.nodes.backoff import Backoff
 from meshctl.nodes.slots import Slot
 from meshctl.plan import Cut
 from meshctl.plan.effects import loaded_package
-from meshctl.plan.observed_files import WIRELESS, packages_seen
-from meshctl.plan.radios import EVERY_RADIO, NO_RADIOS, Radios, restarting_radios
+from meshctl.plan.observed_files import WIRELESS
+from meshctl.plan.radios import NO_RADIOS, Radios
 from meshctl.render.rendered import MARKER_PATH
 
 LOCK_SLACK_S = 60  # the lock outlives the confirm window by this much, for the actions after it
@@ -82,10 +83,11 @@ class ChangeInProgress:
     is_confirm_unanswered: bool = False
     extra_s: float = 0.0  # how long its `extra` script may take before the confirm window starts
     armed_in_s: float = 0.0  # how long its node took to arm it: a start takes about as long
+    held_s: float = 0.0  # how long it may wait for other nodes to be armed, before it starts
     # uploads again what that script reads from the node's memory, which a reboot has emptied
     upload_again: Callable[[SshConnection], object] | None = None
     radios: Radios = NO_RADIOS
-    started_s: float | None = None  # by the monotonic clock
+    started_s: float | None = None  # by the monotonic clock; in the future if it was scheduled
     found_at: Endpoint | None = None  # the one of `candidates` where the node answered
     # whether its services have reloaded: only a connection opened after that proves the node reachable
     is_reloaded: bool = False
@@ -114,6 +116,11 @@ class ChangeInProgress:
         """Whether it may affect who can log in: all but settings of radios, which only decide over which links."""
         harmless = (WIRELESS, MARKER_PATH)
         return self.extra_s > 0 or any(change.path not in harmless for change in self.ctx.plan.files)
+
+    @property
+    def starts_in_s(self) -> float:
+        """How long it is until a scheduled change starts."""
+        return 0.0 if self.started_s is None else max(0.0, self.started_s - time.monotonic())
 
     @property
     def is_window_over(self) -> bool:
@@ -149,18 +156,8 @@ def new_change(ctx: NodeContext, old: Endpoint, *, window_s: int | None = None) 
         window_s or ctx.node.confirm_window_s,
         old,
         ctx.run.connections.candidates(ctx.node),
-        radios=_radios_of(ctx),
+        radios=radios_of(ctx.plan, ctx.desired, ctx.before),
     )
-
-
-def _radios_of(ctx: NodeContext) -> Radios:
-    """The radios that may restart with the plan's changes. Where one is left over, all may be taken down and up."""
-    if ctx.plan.left_over:
-        return EVERY_RADIO
-    if not any(change.path == WIRELESS for change in ctx.plan.files):
-        return NO_RADIOS
-    before = packages_seen([WIRELESS], ctx.before)["wireless"]
-    return restarting_radios(before, next((file.package for file in ctx.desired.files if file.path == WIRELESS), None))
 
 
 def arm(change: ChangeInProgress, connection: SshConnection) -> None:
@@ -170,7 +167,7 @@ def arm(change: ChangeInProgress, connection: SshConnection) -> None:
     await_first_boot(ctx, connection)
     with ctx.step("stage"):
         install_switch(ctx, connection)
-        deadman.lock(connection, owner, ttl_s=change.window_s + LOCK_SLACK_S)
+        deadman.lock(connection, owner, ttl_s=change.window_s + LOCK_SLACK_S + math.ceil(change.held_s))
         rate = ctx.run.rate_bytes_per_s
         deadman.stage(connection, owner, change.payload, rate_bytes_per_s=rate, progress=ctx.progress)
     with ctx.step("arm"):
@@ -240,24 +237,24 @@ def send(change: ChangeInProgress, connection: SshConnection, slot: Slot) -> Non
     change.is_reloaded = status is not None
 
 
-def start(change: ChangeInProgress, connection: SshConnection, *, at_uptime_s: float | None = None) -> None:
-    """Start the change: in a moment, or when the node's uptime reaches `at_uptime_s`.
+def start(
+    change: ChangeInProgress, connection: SshConnection, *, at_uptime_s: float | None = None, due_s: float | None = None
+) -> None:
+    """Start the change: in a moment, or when the node's uptime reaches `at_uptime_s`, which is `due_s` by the monotonic
+    clock.
 
     The change may cut this connection while its confirm window runs, so the wait for the answer is short. Raises
     NodeRefused, Unreachable.
     """
     change.listener.started()
-    change.started_s = time.monotonic()
+    change.started_s = time.monotonic() if due_s is None else due_s
     change.is_reloaded = False
-    patience = threading.Timer(min(APPLY_ANSWER_TIMEOUT_S, change.window_s / 4), connection.close)
-    patience.daemon = True
-    patience.start()
     in_s = None if at_uptime_s is not None else APPLY_DELAY_S
-    try:
-        with change.ctx.step("apply"):
-            deadman.apply(connection, change.ctx.run.owner, change.id, in_s=in_s, at_uptime_s=at_uptime_s)
-    finally:
-        patience.cancel()
+    with (
+        deadline(min(APPLY_ANSWER_TIMEOUT_S, change.window_s / 4), connection.close),
+        change.ctx.step("apply"),
+    ):
+        deadman.apply(connection, change.ctx.run.owner, change.id, in_s=in_s, at_uptime_s=at_uptime_s)
 
 
 def connect(change: ChangeInProgress) -> SshConnection | None:

@@ -12,7 +12,8 @@ from meshctl.device.scripts import script
 from meshctl.model import Backend, Fleet, Node, Secret
 from meshctl.plan import DesiredState, NodePlan
 from meshctl.plan.effects import loaded_package
-from meshctl.plan.observed_files import WIRELESS, file_info, text_of
+from meshctl.plan.observed_files import WIRELESS, file_info, packages_seen, text_of
+from meshctl.plan.radios import EVERY_RADIO, NO_RADIOS, Radios, restarting_radios
 
 # The id is part of a file name on the node; the nonce must be unguessable for a confirm window of minutes.
 ID_BYTES, NONCE_BYTES = 5, 16
@@ -75,3 +76,13 @@ def services_of(fleet: Fleet, node: Node) -> tuple[str, ...]:
     meshes = (fleet.meshes[name] for name in node.meshes)
     named = (mesh.operator_parts.service for mesh in meshes if mesh.backend is Backend.MESHMERIZE)
     return tuple(dict.fromkeys(service for service in named if service))
+
+
+def radios_of(plan: NodePlan, desired: DesiredState, before: Observation) -> Radios:
+    """The radios that may restart with the plan's changes. Where one is left over, all may be taken down and up."""
+    if plan.left_over:
+        return EVERY_RADIO
+    if not any(change.path == WIRELESS for change in plan.files):
+        return NO_RADIOS
+    seen = packages_seen([WIRELESS], before)["wireless"]
+    return restarting_radios(seen, next((file.package for file in desired.files if file.path == WIRELESS), None))

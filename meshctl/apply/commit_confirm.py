@@ -82,7 +82,7 @@ def poll(change: ChangeInProgress) -> Outcome:
     A connection that was opened after the services had reloaded is kept: another one would prove nothing more.
     """
     run_context = change.ctx.run
-    backoff = Backoff(_limit_s(change), run_context.interrupt)
+    backoff = Backoff(change.starts_in_s + _limit_s(change), run_context.interrupt)
     if not change.is_reloaded:
         run_context.interrupt.wait(change.first_look_s)
     proof: SshConnection | None = None

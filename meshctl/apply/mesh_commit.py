@@ -37,7 +37,9 @@ from meshctl.apply.participant import (
     canceled_because,
     cause_of,
     entries_lost,
+    lead_s,
     quorum_of,
+    rolled_back_outcome,
     short_of_quorum,
     unmet_of,
 )
@@ -49,12 +51,8 @@ from meshctl.fleet import Outcome, Result
 from meshctl.nodes.backoff import Backoff
 from meshctl.wording import counted
 
-# The scheduled moment is this many round trips of the slowest node ahead, or this many times the time that the slowest
-# took to be armed, for each batch of parallel commands, and at least LEAD_S: the slowest board needs that to start a
-# start-stop-daemon and two shells.
-LEAD_ROUND_TRIPS = 6
-LEAD_ARMS = 3
-LEAD_S = 2.0
+# What a loaded node needs to stage and arm a change. The first waits, with its lock, for every further batch.
+ARM_S = 60.0
 # The share of the confirm window reserved for confirming.
 CONFIRM_SHARE = 0.25
 # The fact in the outcome of a node left in the old cell: what differs between its cell and the mesh's.
@@ -76,6 +74,16 @@ class _MeshCommit:
     @property
     def name(self) -> str:
         return "the simultaneous change" if self.is_together else "the mesh change"
+
+    @property
+    def turns(self) -> int:
+        """How many batches of parallel commands reach all nodes."""
+        return math.ceil(len(self.participants) / self.parallel)
+
+    @property
+    def longest_s(self) -> float:
+        """How long after it is armed the change of a node has ended."""
+        return self.turns * ARM_S + self.window_s + GRACE_AFTER_WINDOW_S
 
     @property
     def success(self) -> str:
@@ -136,13 +144,14 @@ def _arm(commit: _MeshCommit, participant: Participant) -> None:
     try:
         with commit.run.connections.borrow(ctx.node) as connection:
             participant.change = new_change(ctx, connection.endpoint, window_s=commit.window_s)
+            participant.change.held_s = commit.turns * ARM_S
             arm(participant.change, connection)
             if commit.is_together:
                 _watch_unchanged(commit, participant.change, connection)
             else:
                 # it may be called off before its radio restarts, and then keeps its entries of those that did restart
                 listener = participant.change.listener
-                listener.watch_own_entries(connection, for_s=commit.window_s + GRACE_AFTER_WINDOW_S)
+                listener.watch_own_entries(connection, for_s=commit.longest_s)
             participant.clock = measure_uptime(connection)
     except NodeError as error:
         participant.failure = Outcome(ctx.name, Result.FAILED, str(error), hint=error.hint)
@@ -155,19 +164,19 @@ def _watch_unchanged(commit: _MeshCommit, change: ChangeInProgress, connection: 
     change.listener.restarting(
         [other.name for other in commit.participants if other.change is not None and other.change.radios]
     )
-    change.listener.armed(connection, for_s=commit.window_s + GRACE_AFTER_WINDOW_S)
+    change.listener.armed(connection, for_s=commit.longest_s)
 
 
 def _schedule(commit: _MeshCommit) -> None:
     """Schedule the change on every node, in its own uptime."""
-    moment = time.monotonic() + _lead_s(commit)
+    moment = time.monotonic() + lead_s(commit.participants, commit.turns)
 
     def start_one(participant: Participant) -> None:
         if participant.change is None or participant.clock is None:
             return
         try:
             with commit.run.connections.borrow(participant.ctx.node) as connection:
-                _start_at(commit, participant, connection, participant.clock.uptime_at(moment))
+                _start_at(commit, participant, connection, moment)
             participant.is_scheduled = True
         except NodeError as error:
             participant.failure = Outcome(participant.name, Result.FAILED, str(error), hint=error.hint)
@@ -179,23 +188,19 @@ def _schedule(commit: _MeshCommit) -> None:
     if all(participant.is_scheduled for participant in commit.participants):
         for participant in commit.participants:
             commit.run.connections.drop(participant.name)
-        time.sleep(max(0.0, moment - time.monotonic()))
+        commit.run.interrupt.wait(max(0.0, moment - time.monotonic()))
+        for participant in commit.participants:
+            if participant.change is not None:
+                # a station entry from between the order and the moment is stale, too
+                participant.change.listener.started()
 
 
-def _lead_s(commit: _MeshCommit) -> float:
-    """How far ahead the moment is, so that every node has its start in time."""
-    participants = commit.participants
-    round_trip_s = max((2 * each.clock.error_s for each in participants if each.clock is not None), default=0.0)
-    arm_s = max((each.change.armed_in_s for each in participants if each.change is not None), default=0.0)
-    turns = math.ceil(len(participants) / commit.parallel)
-    return max(LEAD_S, turns * max(LEAD_ROUND_TRIPS * round_trip_s, LEAD_ARMS * arm_s))
-
-
-def _start_at(commit: _MeshCommit, participant: Participant, connection: SshConnection, at_uptime_s: float) -> None:
+def _start_at(commit: _MeshCommit, participant: Participant, connection: SshConnection, moment: float) -> None:
     """Start it at the moment, or immediately if that has passed: the others are changing, and would leave it behind."""
     assert participant.change is not None
+    assert participant.clock is not None
     try:
-        start(participant.change, connection, at_uptime_s=at_uptime_s)
+        start(participant.change, connection, at_uptime_s=participant.clock.uptime_at(moment), due_s=moment)
     except NodeRefused as refusal:
         if refusal.code != "too-late" or any(each.failure for each in commit.participants):
             raise
@@ -382,7 +387,7 @@ def _roll_back(commit: _MeshCommit, reason: str) -> dict[str, Outcome]:
 
     commit.each(commit.participants, poll_one)
     return {
-        participant.name: _rolled_back_outcome(
+        participant.name: rolled_back_outcome(
             ended.get(participant.name),
             participant.name,
             f"{'all nodes were' if commit.is_together else 'the whole mesh was'} rolled back: {reason}",
@@ -390,11 +395,3 @@ def _roll_back(commit: _MeshCommit, reason: str) -> dict[str, Outcome]:
         )
         for participant in commit.participants
     }
-
-
-def _rolled_back_outcome(outcome: Outcome | None, name: str, reason: str, gap: str) -> Outcome:
-    if outcome is None:
-        return Outcome(name, Result.PENDING, reason)
-    if outcome.result is Result.ROLLED_BACK:
-        return Outcome(name, Result.ROLLED_BACK, "; ".join(filter(None, (reason, gap))))
-    return outcome

@@ -11,8 +11,14 @@ from meshctl.apply.change_in_progress import ChangeInProgress
 from meshctl.apply.context import NodeContext
 from meshctl.apply.next_action import Action, reason_text
 from meshctl.device.openwrt import UptimeSample
-from meshctl.fleet import Outcome
+from meshctl.fleet import Outcome, Result
 
+# The scheduled moment is this many round trips of the slowest node ahead, or this many times the time that the slowest
+# took to be armed, for each batch of parallel commands, and at least LEAD_S: the slowest board needs that to start a
+# start-stop-daemon and two shells.
+LEAD_ROUND_TRIPS = 6
+LEAD_ARMS = 3
+LEAD_S = 2.0
 # Each of the others has its own reason in its own outcome.
 MAX_NAMED = 3
 
@@ -77,6 +83,14 @@ def canceled_because(participants: Iterable[Participant], step: str, what: str =
     return f"{what} was canceled: {'; '.join(failed[:MAX_NAMED])}{more}"
 
 
+def lead_s(participants: Iterable[Participant], turns: int) -> float:
+    """How far ahead the moment is, so that every node has its start in time; all are reached in so many batches."""
+    members = tuple(participants)
+    round_trip_s = max((2 * each.clock.error_s for each in members if each.clock is not None), default=0.0)
+    arm_s = max((each.change.armed_in_s for each in members if each.change is not None), default=0.0)
+    return max(LEAD_S, turns * max(LEAD_ROUND_TRIPS * round_trip_s, LEAD_ARMS * arm_s))
+
+
 def quorum_of(participants: Iterable[Participant], quorum: float) -> dict[str, int]:
     """How many nodes of each changing mesh must prove themselves."""
     counts = Counter(mesh for participant in participants for mesh in participant.meshes)
@@ -117,3 +131,12 @@ def cause_of(participant: Participant) -> str:
         return ""
     is_common = change.status.last_reason.partition("+")[0] in ("abort", "timeout")
     return "" if is_common else f"{participant.name}: {reason_text(change.status.last_reason)}"
+
+
+def rolled_back_outcome(outcome: Outcome | None, name: str, reason: str, gap: str) -> Outcome:
+    """The outcome of a participant after all were rolled back for `reason`; `gap` is its own."""
+    if outcome is None:
+        return Outcome(name, Result.PENDING, reason)
+    if outcome.result is Result.ROLLED_BACK:
+        return Outcome(name, Result.ROLLED_BACK, "; ".join(filter(None, (reason, gap))))
+    return outcome

@@ -103,7 +103,11 @@ def prepare(
             observer=observer,
         )
         _remember(journal, fleet, others)
-        observed = replace(observed, observations={**observed.observations, **others.observations})
+        observed = replace(
+            observed,
+            observations={**observed.observations, **others.observations},
+            silent_servers=observed.silent_servers | others.silent_servers,
+        )
         away |= others.unreachable
         single = replace(single, unchanged=_unchanged_plans(renderer, others, salt, owner))
     if reconnects and away and not signal.stopping:

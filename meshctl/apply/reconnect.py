@@ -158,16 +158,20 @@ def entries_of_unreachable(
 ) -> dict[str, list[StationEntry]]:
     """Holder -> its entries of radios that it hears now and that belong to unreachable nodes. An unknown MAC may
     be that of an unreachable node without a known one; a stranger's radio, which takes no part in the mesh, answers no
-    echo request either way, and is left alone."""
+    echo request either way, and is left alone.
+
+    A node whose SSH server accepts connections and stays silent is left alone, too: a stale entry drops what accepts
+    them, and removing one that is not stale would cut the node off."""
     observed = {mac for observation in fleet_observation.observations.values() for mac in mesh_macs(observation)}
-    is_any_unknown = bool(set(fleet_observation.unreachable) - set(owners.values()))
+    away = set(fleet_observation.unreachable) - fleet_observation.silent_servers
+    is_any_unknown = bool(away - set(owners.values()))
     found: dict[str, list[StationEntry]] = {}
     for holder, observation in fleet_observation.observations.items():
         for station in observation.stations or ():
             mac = station.mac.lower()
             if station.inactive_ms is None or station.inactive_ms >= HEARD_MS or mac in observed:
                 continue
-            is_away = owners[mac] in fleet_observation.unreachable if mac in owners else is_any_unknown
+            is_away = owners[mac] in away if mac in owners else is_any_unknown
             if is_away and (holder in found or len(found) < MAX_QUERIED):
                 found.setdefault(holder, []).append(StationEntry(holder, station.ifname, station.mac))
     return found

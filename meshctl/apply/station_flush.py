@@ -46,6 +46,7 @@ from meshctl.apply.stale_stations import (
     watch_script,
 )
 from meshctl.device.connection import Deadlines
+from meshctl.device.liveness import deadline
 from meshctl.device.observation import Observation
 from meshctl.device.ssh import SshConnection
 from meshctl.errors import NodeError
@@ -169,14 +170,8 @@ class StationFlush:
     @contextmanager
     def connecting(self) -> Iterator[None]:
         """Query the neighbors in the background if the block takes so long that the node must be unreachable."""
-        timer = threading.Timer(SLOW_CONNECT_S, self.unreachable)
-        timer.daemon = True
-        timer.start()
-        try:
+        with deadline(SLOW_CONNECT_S, self.unreachable):
             yield
-        finally:
-            timer.cancel()
-            timer.join()
 
     @contextmanager
     def waiting(self, connection: SshConnection) -> Iterator[None]:
@@ -385,16 +380,13 @@ def _query_one(run_context: RunContext, name: str, script: Script) -> str | None
         connection = connections.acquire(name) or connections.open(run_context.fleet.nodes[name], deadlines=_DEADLINES)
     except NodeError:
         return None
-    # a pooled connection has longer deadlines, and may lead through the unreachable node
-    patience = threading.Timer(QUERY_TIMEOUT_S, connection.close)
-    patience.daemon = True
-    patience.start()
     try:
-        done = connection.run(script(), timeout_s=QUERY_TIMEOUT_S)
+        # a pooled connection has longer deadlines, and may lead through the unreachable node
+        with deadline(QUERY_TIMEOUT_S, connection.close):
+            done = connection.run(script(), timeout_s=QUERY_TIMEOUT_S)
     except NodeError:
         connection.close()
         return None
     finally:
-        patience.cancel()
         connections.release(name, connection)
     return done.stdout.strip()

@@ -25,12 +25,21 @@ __all__ = [
 ]
 
 
+# Phases of a login once its server has accepted the connection.
+HANDSHAKE, AUTHENTICATION = "the SSH handshake", "authentication"
+
+
 class Timeout(Unreachable):
     """One of our deadlines passed; `phase` is which: connect, handshake, auth, channel, run."""
 
     def __init__(self, message: str, *, phase: str, hint: str = "") -> None:
         super().__init__(message, hint=hint)
         self.phase = phase
+
+    @property
+    def is_server_silent(self) -> bool:
+        """Whether the SSH server has accepted the connection, and then did not answer."""
+        return self.phase in (HANDSHAKE, AUTHENTICATION)
 
 
 class ConnectionLost(Unreachable):

@@ -20,6 +20,8 @@ from meshctl import event_log
 from meshctl.device.authentication import LoginAttempt, login_attempts
 from meshctl.device.connection import Completed, Connection, Credentials, Deadlines, Endpoint
 from meshctl.device.errors import (
+    AUTHENTICATION,
+    HANDSHAKE,
     AuthenticationRefused,
     ChannelClosed,
     ConnectionLost,
@@ -167,7 +169,7 @@ def _handshake(
     transport.clear_to_send_timeout = limits.run_s
     _prefer(transport, known, legacy=legacy)
     try:
-        with _translating_errors(endpoint, transport, limits.handshake_s, "the SSH handshake"):
+        with _translating_errors(endpoint, transport, limits.handshake_s, HANDSHAKE):
             try:
                 transport.start_client(timeout=limits.handshake_s * 2)
             except paramiko.ssh_exception.IncompatiblePeer as error:
@@ -206,7 +208,7 @@ def _login(
     """Whether one of `attempts` was accepted, and otherwise the methods the server offers."""
     allowed: tuple[str, ...] = ()
     for attempt in attempts:
-        with _translating_errors(endpoint, transport, limits.auth_s, "authentication"):
+        with _translating_errors(endpoint, transport, limits.auth_s, AUTHENTICATION):
             try:
                 attempt.run(transport, endpoint.user)
             except paramiko.BadAuthenticationType as error:

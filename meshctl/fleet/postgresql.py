@@ -209,6 +209,8 @@ class Database:
                 yield
             finally:
                 watchdog.cancel()
+                # one that has just fired would end a later query
+                watchdog.join()
         except psycopg.Error as error:
             if self._connection.broken or self._connection.closed or isinstance(error, psycopg.errors.AdminShutdown):
                 raise DatabaseLost(f"{self.label}: the connection was lost: {_one_line(error)}") from error

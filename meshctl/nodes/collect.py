@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from ipaddress import ip_address
 
 from meshctl.device import deadman
-from meshctl.device.errors import NodeRefused
+from meshctl.device.errors import NodeRefused, Timeout
 from meshctl.device.observation import ChangeStatus, Observation
 from meshctl.device.observe import observe
 from meshctl.device.ssh import SshConnection
@@ -40,6 +40,8 @@ class FleetObservation:
     observations: Mapping[str, Observation]
     unreachable: Mapping[str, str]
     refused: Mapping[str, NodeError] = field(default_factory=dict)
+    # the unreachable nodes whose SSH server has accepted a connection, and then did not answer
+    silent_servers: frozenset[str] = frozenset()
 
     def graph(self, fleet: Fleet, known: Mapping[str, LastKnown]) -> Graph:
         """The mesh as these nodes observe it."""
@@ -136,7 +138,12 @@ def collect(
         if name not in found and (name not in errors or isinstance(errors[name], Unreachable))
     }
     refused = {name: error for name, error in errors.items() if not isinstance(error, Unreachable)}
-    return FleetObservation({name: found[name] for name in wanted if name in found}, unreachable, refused)
+    silent_servers = frozenset(
+        name for name, error in errors.items() if isinstance(error, Timeout) and error.is_server_silent
+    )
+    return FleetObservation(
+        {name: found[name] for name in wanted if name in found}, unreachable, refused, silent_servers
+    )
 
 
 def observe_cleared(connection: SshConnection, paths: tuple[str, ...], interrupt: Interrupt) -> Observation:

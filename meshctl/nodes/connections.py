@@ -16,7 +16,7 @@ from typing import NamedTuple, Protocol
 
 from meshctl.device.authentication import own_keys
 from meshctl.device.connection import Credentials, Deadlines, Endpoint, OwnKey
-from meshctl.device.errors import ConnectionLost
+from meshctl.device.errors import ConnectionLost, Timeout
 from meshctl.device.ssh import SshConnection, connect
 from meshctl.device.traffic import TrafficMeter
 from meshctl.device.trust import HostKeyPolicy, TrustStore
@@ -144,11 +144,16 @@ class ConnectionPool:
             return connection
 
         places = (endpoint,) if endpoint is not None else self.candidates(node)
+        silent_server: Timeout | None = None
         while True:
             where, *places_left = places
             try:
                 return connect_to(where)
-            except Unreachable as error:
+            except Unreachable as failure:
+                if isinstance(failure, Timeout) and failure.is_server_silent:
+                    silent_server = failure
+                # a server that accepts says more than that it has no other address
+                error = silent_server or failure
                 places = tuple(places_left)
                 if not places:
                     is_pinned_only = policy is None and self.policy is None
@@ -157,7 +162,7 @@ class ConnectionPool:
                         with suppress(NodeError):
                             return connect_to(former)
                     error.hint = self._site_hint(node) or error.hint
-                    raise
+                    raise error from failure.__cause__
 
     def _former_endpoint(self, node: Node) -> Endpoint | None:
         place = self.former_places().get(node.name)

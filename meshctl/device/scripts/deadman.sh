@@ -8,14 +8,14 @@
 # after a power cut the marker alone says what to do. Content is synced before the rename that makes it count.
 # Restoring moves the kept files back one by one: done twice, or half and then again, it ends the same, and it needs no
 # free flash.
-VERSION=12
+VERSION=13
 SELF=/usr/sbin/meshctl-deadman
 CHANGE=/etc/meshctl/change # flash: marker, manifest, reload, new/ (to come), prev/ and previous (to go back to), extra, last.*
 LAST=/etc/meshctl/last     # flash: "ID OUTCOME REASON NONCE_SHA256" of the last change that ended
 SNAPSHOT=/var/run/rpcd/snapshot-files # RAM: what rpcd copies back when its timer ends
 RUN=/tmp/meshctl           # RAM: locks and timers; a reboot forgets them, as it should
 SPARE_KIB=64               # flash that must stay free: uci, dropbear and jffs2's garbage collector write too
-GUARD_GRACE_CS=3000        # the second timer fires 30 s after the first should have
+GUARD_GRACE_CS=3000        # the second timer fires 30 s after the first should have, or once that is gone
 EXPIRE_GRACE_CS=1500       # an armed change that was not started ends so long after its owner's lock has
 START_LIMIT_CS=1500        # a loaded radio starts a process within 15 s, or something is wrong with it
 NEWLINE='
@@ -119,6 +119,14 @@ lock() { # OWNER TTL_S
 		[ "$LOCK_OWNER" = "$held_before" ] || [ ! -e "$f" ] || rm -f "$f"
 	done
 	answer "lock_owner=$1"
+}
+
+# keep_lock OWNER TTL_S: renews the lock when less than half of its time is left, or it has expired and nobody took it: a
+# bundle may arrive slowly, and a flash that has to erase blocks first may take longer than the lock lasts
+keep_lock() {
+	read_lock
+	[ -z "$LOCK_OWNER" ] || need_lock "$1"
+	[ $LOCK_LEFT -gt $(($2 * 50)) ] || write_lock "$1" $(($2 * 100))
 }
 
 unlock() { # OWNER
@@ -492,9 +500,11 @@ change() { # OWNER TTL_S ID NONCE_SHA256 WINDOW_S LIMIT_S BUNDLE_SHA256: the bun
 	trap 'rm -f "$bundle"' EXIT
 	cat 2>/dev/null >"$bundle" || refuse tmp-full "no room in $RUN for the bundle"
 	[ "$(hash_of "$bundle")" = "$7" ] || refuse bad-bundle "the bundle was damaged on the way"
+	keep_lock "$1" "$2"
 	stage "$1" "$3" "$bundle" "$4" "$5"
 	rm -f "$bundle"
 	trap - EXIT
+	keep_lock "$1" "$2"
 	arm "$1" "$3" "$4" "$5"
 	apply "$1" "$3" now
 	now
@@ -606,10 +616,13 @@ reload() { # SCRIPT_TEXT [UPTIME_S]: in the background, so that no hanging reloa
 		echo $? >"$RUN/reloaded"
 	) &
 	reload_pid=$!
+	echo $reload_pid 2>/dev/null >"$RUN/reload.waits"
 }
 
 # Two of reload_config at once take each other's list of sums away, and then tell no service of what changed.
+# The one under way may have been begun by a timer that was killed since.
 end_reload() {
+	[ -n "$reload_pid" ] || ! alive "$RUN/reload.waits" || reload_pid=$pid
 	[ -n "$reload_pid" ] || return 0
 	now
 	limit=$((NOW + RELOAD_TURN_CS))
@@ -691,13 +704,21 @@ guard() { # ID DUE_CS: detached; ends the change if `watch` was killed
 	[ "$ID" = "$1" ] || exit 0
 	limit=$(($2 + WINDOW * 100 + GUARD_GRACE_CS))
 	[ ! -f "$CHANGE/extra" ] || limit=$((limit + EXTRA_LIMIT_CS))
-	while now && [ $NOW -lt $limit ] && is_armed; do
-		if [ $((limit - NOW)) -gt 500 ]; then pause 4; else pause 1; fi
+	while now && is_armed && { [ $NOW -lt $limit ] || is_watched "$2"; }; do
+		if [ $((limit - NOW)) -gt 0 ] && [ $((limit - NOW)) -le 500 ]; then pause 1; else pause 4; fi
 	done
 	while [ -f "$CHANGE/restoring.$ID" ] && alive "$TIMER/watch.pid"; do pause 1; done
 	{ is_armed || [ -f "$CHANGE/restoring.$ID" ]; } || exit 0
 	applied_at_now
 	restore guard
+}
+
+# is_watched DUE_CS: `watch` runs and its time is not over. Its window begins when the files are in place, which takes a
+# loaded node with a slow flash longer than the grace.
+is_watched() {
+	alive "$TIMER/watch.pid" || return 1
+	read -r began 2>/dev/null <"$TIMER/applied" || began=$(($1 + EXTRA_LIMIT_CS))
+	[ $NOW -lt $((began + WINDOW * 100 + GUARD_GRACE_CS)) ]
 }
 
 expire() { # ID DUE_CS: detached; ends a change that its owner armed and never started, once it has lost the lock

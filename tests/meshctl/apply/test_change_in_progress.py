@@ -11,19 +11,31 @@ from typing import cast
 import pytest
 
 from meshctl.apply import change_in_progress, commit_confirm
-from meshctl.apply.change_in_progress import ROLLBACK_S, ChangeInProgress, connect, observe_and_decide
+from meshctl.apply.change_in_progress import (
+    LOCK_SLACK_S,
+    ROLLBACK_S,
+    ChangeInProgress,
+    arm,
+    connect,
+    observe_and_decide,
+    start,
+)
 from meshctl.apply.commit_confirm import _observe_once, _uncertain
 from meshctl.apply.context import NodeContext
 from meshctl.apply.health_checks import Expectation
 from meshctl.apply.next_action import Action
+from meshctl.device import deadman
 from meshctl.device.connection import Deadlines, Endpoint
 from meshctl.device.deadman import Change, NewFile
 from meshctl.device.errors import AuthenticationRefused
 from meshctl.device.observation import ChangeStatus, NetInterface, Observation
 from meshctl.device.ssh import SshConnection
 from meshctl.errors import Unreachable
-from meshctl.fleet import Outcome, Result
+from meshctl.fleet import Interrupt, Outcome, Result
 from meshctl.model import Secret
+from meshctl.nodes.backoff import Backoff
+from meshctl.nodes.slots import ChannelSlots
+from meshctl.plan import Cut
 from meshctl.render import LAN_FILTER_PATH
 from meshctl.uci import parse
 
@@ -183,3 +195,47 @@ def test_a_change_that_left_no_trace_does_not_get_the_reason_of_an_earlier_one(
     )
     connection = cast("SshConnection", None)
     assert commit_confirm._act(cast("ChangeInProgress", change), connection, is_proof=False) == outcome
+
+
+def test_the_window_of_a_scheduled_change_begins_at_its_moment(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The order comes earlier, by as much as the slowest of many nodes needs, which may be longer than the window."""
+    change = a_change()
+    cast("SimpleNamespace", change.listener).started = lambda: None
+    run = cast("SimpleNamespace", change.ctx.run)
+    run.owner, run.connections = "alice", SimpleNamespace(slots=ChannelSlots())
+    ctx = cast("SimpleNamespace", change.ctx)
+    ctx.name, ctx.step, ctx.plan = "b01", lambda _: nullcontext(), SimpleNamespace(cut=Cut.NOTHING)
+    monkeypatch.setattr(deadman, "apply", lambda *_, **__: 0.0)
+    ordered_s = time.monotonic() - change.window_s - ROLLBACK_S - 1
+    connection = cast("SshConnection", SimpleNamespace(close=lambda: None))
+    start(change, connection, at_uptime_s=100.0, due_s=ordered_s + 3600.0)
+    assert (change.is_window_over, change.is_undone) == (False, False)
+    limits: list[float] = []
+
+    def over(limit_s: float, interrupt: Interrupt) -> Backoff:
+        limits.append(limit_s)
+        return Backoff(0.0, interrupt)
+
+    monkeypatch.setattr(commit_confirm, "Backoff", over)
+    run.interrupt = Interrupt()
+    assert commit_confirm.poll(change).result is Result.UNCERTAIN
+    # one that is canceled is polled until its own end
+    assert limits[0] > 3400.0 - ROLLBACK_S + change.window_s
+
+
+def test_the_lock_lasts_while_a_node_waits_for_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Seen in the sources: the first of many nodes dropped its armed change before the last one was armed."""
+    change = a_change()
+    ctx = cast("SimpleNamespace", change.ctx)
+    ctx.step = lambda _: nullcontext()
+    ctx.run.owner, ctx.run.rate_bytes_per_s, ctx.progress = "alice", None, None
+    locks: list[int] = []
+    for name in ("await_first_boot", "install_switch"):
+        monkeypatch.setattr(change_in_progress, name, lambda *_: None)
+    for name in ("stage", "arm"):
+        monkeypatch.setattr(deadman, name, lambda *_, **__: None)
+    monkeypatch.setattr(deadman, "lock", lambda *_, ttl_s: locks.append(ttl_s))
+    for held_s in (0.0, 300.5):
+        change.held_s = held_s
+        arm(change, CONNECTION)
+    assert locks == [60 + LOCK_SLACK_S, 60 + LOCK_SLACK_S + 301]

@@ -12,11 +12,20 @@ from typing import cast
 import pytest
 
 from meshctl.apply import mesh_commit
+from meshctl.apply import participant as participant_module
 from meshctl.apply.change_in_progress import ChangeInProgress
 from meshctl.apply.context import NodeContext, RunContext
 from meshctl.apply.mesh_commit import _MeshCommit, commit_mesh
 from meshctl.apply.next_action import Action
-from meshctl.apply.participant import Participant, canceled_because, cause_of, entries_lost, quorum_of, short_of_quorum
+from meshctl.apply.participant import (
+    Participant,
+    canceled_because,
+    cause_of,
+    entries_lost,
+    lead_s,
+    quorum_of,
+    short_of_quorum,
+)
 from meshctl.device.errors import NodeRefused
 from meshctl.device.observation import ChangeStatus, Observation
 from meshctl.device.openwrt import UptimeSample
@@ -125,13 +134,17 @@ def test_a_node_that_is_armed_to_change_its_cell_watches_its_station_entries(mon
     watching: list[float] = []
     listener = SimpleNamespace(watch_own_entries=lambda _, for_s: watching.append(for_s))
     monkeypatch.setattr(mesh_commit, "new_change", lambda *ctx, **window: SimpleNamespace(listener=listener))
-    monkeypatch.setattr(mesh_commit, "arm", lambda *change: None)
+    held_s: list[float] = []
+    monkeypatch.setattr(mesh_commit, "arm", lambda change, _: held_s.append(change.held_s))
     monkeypatch.setattr(mesh_commit, "measure_uptime", lambda _: None)
     run = cast("RunContext", SimpleNamespace(connections=SimpleNamespace(borrow=borrow)))
-    member = Participant(cast("NodeContext", SimpleNamespace(node=None, name="b01")))
+    members = [Participant(cast("NodeContext", SimpleNamespace(node=None, name=f"b{number}"))) for number in range(9)]
     with ThreadPoolExecutor(1) as pool:
-        mesh_commit._arm(mesh_commit._MeshCommit(run, [member], 60, 1, (), is_together=False, pool=pool), member)
-    assert (watching[0] > 60, member.failure) == (True, None)
+        mesh_commit._arm(mesh_commit._MeshCommit(run, members, 60, 2, (), is_together=False, pool=pool), members[0])
+    assert members[0].failure is None
+    # five batches of two: its lock and its watch last until the last one is armed, too
+    assert held_s == [5 * mesh_commit.ARM_S]
+    assert watching[0] >= 5 * mesh_commit.ARM_S + 60
 
 
 def test_a_node_that_was_scheduled_names_the_one_for_which_it_is_called_off(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -202,13 +215,24 @@ def test_a_node_whose_answer_to_the_start_was_lost_may_have_changed(
 class TestMoment:
     """Seen on a busy host: the base's start arrived after the moment, so the others changed their cell without it."""
 
+    @pytest.fixture(autouse=True)
+    def restarting_radios(self) -> None:
+        # the nodes whose radios may restart from now on
+        self.restarting: list[str] = []
+
     def commit(self, participants: Sequence[Participant], notes: list[str], pool: ThreadPoolExecutor) -> _MeshCommit:
         connections = SimpleNamespace(borrow=lambda _: nullcontext(), drop=lambda _: None)
-        run = SimpleNamespace(connections=connections, note=lambda text, node: notes.append(f"{node}: {text}"))
+        run = SimpleNamespace(
+            connections=connections,
+            note=lambda text, node: notes.append(f"{node}: {text}"),
+            interrupt=Interrupt(),
+        )
         return _MeshCommit(cast("RunContext", run), participants, 60, 1, (), is_together=False, pool=pool)
 
     def member(self, name: str, *, armed_in_s: float = 0.0) -> Participant:
-        change = cast("ChangeInProgress", SimpleNamespace(name=name, armed_in_s=armed_in_s, last_error=""))
+        listener = SimpleNamespace(started=lambda: self.restarting.append(name))
+        fields = {"name": name, "armed_in_s": armed_in_s, "last_error": "", "listener": listener}
+        change = cast("ChangeInProgress", SimpleNamespace(**fields))
         clock = cast("UptimeSample", SimpleNamespace(error_s=0.01, uptime_at=lambda moment: 100.0))
         ctx = cast("NodeContext", SimpleNamespace(name=name, node=None))
         return Participant(ctx, change=change, clock=clock)
@@ -220,13 +244,16 @@ class TestMoment:
         starts: list[tuple[str, float | None]] = []
         notes: list[str] = []
 
-        def start(change: SimpleNamespace, connection: object, *, at_uptime_s: float | None = None) -> None:
+        def start(
+            change: SimpleNamespace, _: object, *, at_uptime_s: float | None = None, due_s: float | None = None
+        ) -> None:
+            assert (due_s is None) == (at_uptime_s is None)
             starts.append((change.name, at_uptime_s))
             if at_uptime_s is not None and change.name in refusals:
                 raise refusals[change.name]
 
         monkeypatch.setattr(mesh_commit, "start", start)
-        monkeypatch.setattr(mesh_commit, "LEAD_S", 0.0)
+        monkeypatch.setattr(participant_module, "LEAD_S", 0.0)
         participants = [self.member(name) for name in ("b02", "b01", "base")]
         with ThreadPoolExecutor(1) as pool:
             mesh_commit._schedule(self.commit(participants, notes, pool))
@@ -238,6 +265,8 @@ class TestMoment:
         assert starts == [("b02", 100.0), ("b01", 100.0), ("base", 100.0), ("base", None)]
         assert all(each.is_scheduled and each.failure is None for each in participants)
         assert notes == ["base: the start arrived after the moment at which all nodes change; it changes now"]
+        # entries that a neighbor made between the order and the moment are stale, too
+        assert self.restarting == ["b02", "b01", "base"]
 
     def test_a_change_that_is_canceled_starts_on_no_further_node(self, monkeypatch: pytest.MonkeyPatch) -> None:
         refusals: dict[str, NodeError] = {
@@ -247,14 +276,17 @@ class TestMoment:
         starts, _, participants = self.schedule(monkeypatch, refusals)
         assert starts == [("b02", 100.0), ("b01", 100.0), ("base", 100.0)]
         assert [each.is_scheduled for each in participants] == [True, False, False]
+        assert self.restarting == []
 
     def test_the_moment_leaves_the_slowest_node_time_to_start(self) -> None:
         participants = [self.member("b01", armed_in_s=0.1), self.member("b02", armed_in_s=4.0)]
         with ThreadPoolExecutor(1) as pool:
             one_after_the_other = self.commit(participants, [], pool)
-            assert mesh_commit._lead_s(one_after_the_other) == 24.0
-            assert mesh_commit._lead_s(replace(one_after_the_other, parallel=2)) == 12.0
-            assert mesh_commit._lead_s(replace(one_after_the_other, participants=participants[:1])) == 2.0
+            assert one_after_the_other.turns == 2
+            assert replace(one_after_the_other, parallel=2).turns == 1
+        assert lead_s(participants, 2) == 24.0
+        assert lead_s(participants, 1) == 12.0
+        assert lead_s(participants[:1], 1) == 2.0
 
 
 def test_an_entry_node_that_answers_but_fails_its_checks_is_not_said_to_be_away() -> None:

@@ -109,6 +109,17 @@ def test_only_neighbors_that_hear_an_unreachable_node_now_are_asked_for_stale_en
     assert entries_of_unreachable(FleetObservation(around, {}), owners) == {}
 
 
+def test_no_entry_of_a_node_is_touched_whose_server_accepts_connections_and_stays_silent() -> None:
+    """A stale entry drops what accepts a connection, too; one that is removed by mistake cuts the node off."""
+    heard = Station("mesh0", MAC, inactive_ms=200, connected_s=500)
+    around = {"b01": replace(node("b01"), stations=(heard, replace(heard, mac=OTHER)))}
+    owners = {mac: name for name, mac in MACS.items()}
+    seen = FleetObservation(around, {"b02": "no answer to the SSH handshake"}, silent_servers=frozenset({"b02"}))
+    assert entries_of_unreachable(seen, owners) == {}
+    # nor is a radio of an unknown node taken for its own
+    assert entries_of_unreachable(seen, {}) == {}
+
+
 def test_an_unknown_radio_may_belong_to_a_node_without_a_known_mac() -> None:
     """A node that was never seen, and whose MAC the inventory does not have, such as at a site with a new journal."""
     heard = tuple(Station("mesh0", MACS[name], inactive_ms=30) for name in ("b02", "b03", "b04"))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -11,6 +12,7 @@ from typing import cast
 
 import pytest
 
+from meshctl.apply import station_flush
 from meshctl.apply.context import NodeContext, RunContext
 from meshctl.apply.neighbor_query import REMEMBERED_S, known_neighbors
 from meshctl.apply.station_flush import StationFlushes
@@ -361,3 +363,27 @@ def test_current_and_recently_heard_neighbors_are_observed() -> None:
 def test_radios_are_matched_by_name_unless_every_radio_is_selected() -> None:
     assert "mesh7" in EVERY_RADIO
     assert "mesh1" not in Radios(frozenset({"mesh0"}))
+
+
+def test_a_connection_that_a_late_timer_closes_is_not_used_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The answer came just as the timer fired: the connection was in the pool, and then closed under its next user."""
+    is_closing, may_close = threading.Event(), threading.Event()
+    connection, released = SimpleNamespace(is_open=True), list[bool]()
+
+    def close() -> None:
+        is_closing.set()
+        assert may_close.wait(60)
+        connection.is_open = False
+
+    def run(script: str, *, timeout_s: float) -> SimpleNamespace:
+        assert is_closing.wait(60)
+        threading.Timer(0.2, may_close.set).start()
+        return SimpleNamespace(stdout=f"gone {MAC}\n")
+
+    connection.close, connection.run = close, run
+    monkeypatch.setattr(station_flush, "QUERY_TIMEOUT_S", 0.0)
+    neighbors = Neighbors({})
+    pool = cast("SimpleNamespace", neighbors.work.connections)
+    pool.acquire, pool.release = lambda _: connection, lambda _, kept: released.append(kept.is_open)
+    assert station_flush._query_one(neighbors.work, "b01", str) == f"gone {MAC}"
+    assert released == [False]

@@ -5,9 +5,16 @@ from __future__ import annotations
 import threading
 from pathlib import Path
 
+import pytest
+
+from meshctl.device.connection import Endpoint
+from meshctl.device.errors import HANDSHAKE, Timeout
 from meshctl.device.ssh import SshConnection
 from meshctl.device.trust import TrustStore
+from meshctl.errors import Unreachable
 from meshctl.inventory import load_fleet
+from meshctl.nodes import connections
+from meshctl.nodes.collect import collect
 from meshctl.nodes.connections import ConnectionPool
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -56,3 +63,22 @@ def test_a_router_is_also_tried_at_its_address_in_the_robots_lan(tmp_path: Path)
     access.interfaces["rover1-radio"] = "eth1"
     ends = [(end.address, end.interface) for end in access.candidates(fleet.nodes["rover1-radio"])]
     assert ends == [("10.42.0.11", "eth1"), ("10.43.1.1", "eth1"), ("10.42.0.11", ""), ("10.43.1.1", "")]
+
+
+@pytest.mark.parametrize(("phase", "is_silent"), [(HANDSHAKE, True), ("connect", False)])
+def test_a_server_that_accepts_and_stays_silent_is_distinguished_from_a_node_that_does_not_answer(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, phase: str, is_silent: bool
+) -> None:
+    """Also if the node has another address, at which nothing answers."""
+
+    def refuse(endpoint: Endpoint, **_: object) -> SshConnection:
+        if endpoint.address == "10.42.0.11":
+            raise Timeout("silent", phase=phase)
+        raise Unreachable("no route")
+
+    monkeypatch.setattr(connections, "connect", refuse)
+    fleet = load_fleet(ROOT / "inventory/routed")
+    pool = ConnectionPool(fleet, TrustStore(tmp_path / "known_hosts"))
+    observed = collect(pool, [fleet.nodes["rover1-radio"]], parallel=1)
+    assert observed.unreachable == {"rover1-radio": "silent" if is_silent else "no route"}
+    assert observed.silent_servers == ({"rover1-radio"} if is_silent else set())
