@@ -1,4 +1,4 @@
-"""The legacy transport as a ROS 1 node, for the comparison: `LegacyNode` with its ROS names.
+"""The legacy transport as a ROS 1 node, for the comparison: `SocketLegacyNode` with its ROS names.
 
 python3 -m benchmarks.exploration.legacy_node NAME ADDRESS BROADCAST '{"TOPIC": PRIORITY}' OTHER...
 """
@@ -12,7 +12,7 @@ from typing import Any
 import rospy
 from std_msgs.msg import String
 
-from tests.udp_mesh.core.legacy_node import TO_ALL, TYPE, LegacyNode
+from tests.udp_mesh.core.legacy_node import TO_ALL, TYPE, SocketLegacyNode
 from udp_mesh.wire.legacy import PriorityMeshData
 
 
@@ -21,7 +21,7 @@ class RosTopics:
 
     def __init__(self, name: str, address: str, broadcast: str, priorities: dict[str, int], others: list[str]) -> None:
         self.name = name
-        self.node = LegacyNode(name, address, broadcast, self.publish)
+        self.node = SocketLegacyNode(name, address, broadcast, self.publish)
         self.publishers: dict[tuple[str, str], Any] = {}
         for topic, priority in priorities.items():
             for other in (TO_ALL, *others):
