@@ -20,7 +20,7 @@ from meshctl.fleet import Interrupt, Observer, silent
 from meshctl.fleet.journal import Journal, LastKnown
 from meshctl.model import Fleet, Node, NodeState
 from meshctl.nodes.collect import FleetObservation, collect, facts_of, known_macs, login_place
-from meshctl.nodes.connections import ConnectionPool, LoginPlace
+from meshctl.nodes.connections import ConnectionPool, SshAddress
 from meshctl.nodes.desired import Renderer
 from meshctl.nodes.last_seen import MAX_QUERIED, last_seen_of
 from meshctl.nodes.slots import nodes_in_work
@@ -251,7 +251,7 @@ def _node_plans(
     return _NodePlans(plans, desired)
 
 
-def _reached_at(fleet: Fleet, node: Node, former: LoginPlace) -> str:
+def _reached_at(fleet: Fleet, node: Node, former: SshAddress) -> str:
     """Where a node is that has not yet got its address or port."""
     address, port = former
     mesh = next((mesh.name for mesh in fleet.meshes.values() if address in mesh.network), "")

@@ -23,7 +23,7 @@ from meshctl.fleet.journal import LastKnown
 from meshctl.fleet.process import is_dead
 from meshctl.model import Fleet, Node, NodeState
 from meshctl.nodes.backoff import Backoff
-from meshctl.nodes.connections import ConnectionPool, LoginPlace
+from meshctl.nodes.connections import ConnectionPool, SshAddress
 from meshctl.plan.lockout import SSH_PORT, listening_ports
 from meshctl.plan.observed_files import management_address, parsed
 from meshctl.topology import Graph, Report, mesh_macs, observed_graph, report_of, with_alternates
@@ -81,7 +81,7 @@ def known_macs(fleet: Fleet, known: Mapping[str, LastKnown]) -> dict[str, str]:
     return with_alternates(macs)
 
 
-def former_places(fleet: Fleet, known: Mapping[str, LastKnown]) -> dict[str, LoginPlace]:
+def former_places(fleet: Fleet, known: Mapping[str, LastKnown]) -> dict[str, SshAddress]:
     """Where nodes were last seen, if the inventory has another address or port by now: a node that was off, or that has
     not been changed yet, still answers there, on the mesh that it was in."""
     taken = {own.ip for node in fleet.managed() for own in (node.address, node.lan_address) if own is not None}
@@ -95,10 +95,10 @@ def former_places(fleet: Fleet, known: Mapping[str, LastKnown]) -> dict[str, Log
     return found
 
 
-def login_place(facts: Mapping[str, str]) -> LoginPlace | None:
+def login_place(facts: Mapping[str, str]) -> SshAddress | None:
     """Where a node with these facts accepts logins; None if they do not say."""
     try:
-        return LoginPlace(ip_address(facts.get("address", "")), int(facts.get("port", SSH_PORT)))
+        return SshAddress(ip_address(facts.get("address", "")), int(facts.get("port", SSH_PORT)))
     except ValueError:
         return None
 

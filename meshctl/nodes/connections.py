@@ -37,7 +37,7 @@ class Locate(Protocol):
     def __call__(self, node: Node, address: IpAddress) -> tuple[str, int]: ...
 
 
-class LoginPlace(NamedTuple):
+class SshAddress(NamedTuple):
     """Where a node accepts logins."""
 
     address: IpAddress
@@ -70,7 +70,7 @@ class ConnectionPool:
     # node -> local interface it was discovered on, tried first for its new address
     interfaces: dict[str, str] = field(default_factory=dict)
     # node -> where it was last seen, if the inventory has another address or port by now
-    former_places: Callable[[], Mapping[str, LoginPlace]] = dict
+    former_places: Callable[[], Mapping[str, SshAddress]] = dict
     meter: TrafficMeter = field(default_factory=TrafficMeter, repr=False)
     # nodes whose device is on a cable of the operator's: not behind the gateway of their site
     on_bench: set[str] = field(default_factory=set)

@@ -28,9 +28,7 @@ if TYPE_CHECKING:
 CONNECT_S = 5.0
 # of one exchange with a server
 ANSWER_S = 5.0
-# how often a lost server is tried again
-_RECONNECT_S = 1.0
-_KEEPALIVE_S = 5
+_RECONNECT_S, _KEEPALIVE_S = 1.0, 5
 # after how many fetches without a message a work queue is checked for a loss
 _FETCHES = 6
 _T = TypeVar("_T")
@@ -47,9 +45,8 @@ class NatsServer:
 
 
 class NatsClient:
-    """`close` ends it. A connection that is lost is made again in the background; meanwhile everything is `NatsLost`.
-    The first one is `NatsLost`, too, if it fails; with `note` it is tried until it succeeds, and each time `note` gets
-    why it does not, and "" once it does."""
+    """A connection that is lost is made again in the background; meanwhile everything is `NatsLost`. So is a first one
+    that fails; with `note` it is tried until it succeeds, and `note` gets why it fails, and then ""."""
 
     def __init__(self, server: NatsServer, *, note: Callable[[str], None] | None = None) -> None:
         self._server = server

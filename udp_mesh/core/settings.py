@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import Literal
 
-from udp_mesh.core.thin.settings import ThinSettings, check_presence, check_topics
+from udp_mesh.core.thin.settings import ThinSettings, check_thin
 from udp_mesh.crypto import Key
 from udp_mesh.wire.limits import (
     MAX_LOG_TOPIC_BYTES,
@@ -397,5 +397,4 @@ class Settings:
         names = [topic.name for topic in self.topics]
         if len(set(names)) != len(names):
             raise ValueError(f"topics: {next(n for n in names if names.count(n) > 1)!r} is listed twice")
-        check_topics([topic.name for topic in self.topics if topic.thin])
-        check_presence(self.name, self.thin.links)
+        check_thin(self.name, [topic.name for topic in self.topics if topic.thin], self.thin.links)

@@ -109,7 +109,13 @@ class ThinSettings:
             raise ValueError(f"thin.links: expected each name once, found {', '.join(names)}")
 
 
-def check_presence(name: str, links: tuple[ThinLinkSettings, ...]) -> None:
+def check_thin(name: str, topics: list[str], links: tuple[ThinLinkSettings, ...]) -> None:
+    """Raises ValueError if a node of this name with these topics cannot use these links."""
+    _check_topics(topics)
+    _check_presence(name, links)
+
+
+def _check_presence(name: str, links: tuple[ThinLinkSettings, ...]) -> None:
     """Raises ValueError if a presence with this name and one node that is heard does not fit a link's frames: the node
     could not introduce itself."""
     needed = THIN_OVERHEAD_BYTES + INTRODUCTION_BYTES + PRESENCE_BYTES + len(name.encode()) + HEARD_BYTES
@@ -121,7 +127,7 @@ def check_presence(name: str, links: tuple[ThinLinkSettings, ...]) -> None:
             )
 
 
-def check_topics(names: list[str]) -> None:
+def _check_topics(names: list[str]) -> None:
     """Raises ValueError if two topics on thin links have the same hash on the wire."""
     hashes: dict[bytes, str] = {}
     for name in names:
