@@ -1,4 +1,4 @@
-"""The machine's image: Debian's kernel, and an initramfs in two parts.
+"""The machine's image: Debian's kernel, decompressed, and an initramfs in two parts.
 
 `base_image` (cached; rebuilt when its recipe changes): packages, kernel modules, compiled Python.
 `build_initrd` (at every start, under a second of CPU): the base, the nodes' ROM, this package's code, the fleet's spec.
@@ -23,7 +23,7 @@ from pathlib import Path
 import meshctl
 from meshlab import rootfs
 from meshlab.errors import LabError
-from meshlab.qemu import apt, cpio, kernel_modules
+from meshlab.qemu import apt, cpio, kernel_image, kernel_modules
 
 _HERE = Path(__file__).resolve().parent
 _PACKAGE = Path(meshctl.__file__).resolve().parent
@@ -63,7 +63,7 @@ def base_image(cache: Path) -> BaseImage:
     with _locked(cache):
         if not place.exists():
             _build_base(cache, place)
-    return BaseImage(place / "vmlinuz", place / "base.cpio", place / "root")
+    return BaseImage(place / "kernel", place / "base.cpio", place / "root")
 
 
 def build_initrd(image: BaseImage, spec_text: str, token: str, work: Path) -> Path:
@@ -91,7 +91,8 @@ def build_initrd(image: BaseImage, spec_text: str, token: str, work: Path) -> Pa
 
 def _recipe_digest() -> str:
     """The cache key of a base: a digest of the code that builds it."""
-    text = "".join(inspect.getsource(module) for module in (apt, kernel_modules, cpio)) + inspect.getsource(_build_base)
+    sources = [inspect.getsource(module) for module in (apt, kernel_image, kernel_modules, cpio)]
+    text = "".join([*sources, inspect.getsource(_build_base)])
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
@@ -110,7 +111,8 @@ def _build_base(cache: Path, place: Path) -> None:
         _make_folders(root)
         _compile(root, next((root / "usr" / "lib").glob("python3.*")))
         _compile(root, root / "usr" / "lib" / "python3" / "dist-packages")
-        shutil.copy2(next((work / "kernel" / "boot").glob("vmlinuz-*")), made / "vmlinuz")
+        image = next((work / "kernel" / "boot").glob("vmlinuz-*")).read_bytes()
+        (made / "kernel").write_bytes(kernel_image.uncompressed(image))
         with (made / "base.cpio").open("wb") as out:
             cpio.write(root, out)
         root.rename(made / "root")
