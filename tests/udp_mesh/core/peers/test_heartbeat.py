@@ -12,6 +12,7 @@ from udp_mesh.core import peer_lifecycle
 from udp_mesh.core.events import PeerOffline, PeerOnline
 from udp_mesh.core.peers.heartbeat import DISCOVERY_RATE_FACTOR, MIN_GAP_S, REPLY_WITHIN_S, HeartbeatScheduler
 from udp_mesh.core.peers.session import Session
+from udp_mesh.core.peers.session_state import SessionEvent
 from udp_mesh.core.settings import Rates, Topic
 
 RATES = Rates()
@@ -66,6 +67,27 @@ def test_no_new_node_is_answered_without_its_clock() -> None:
         assert fresh == list(beat.heard[: len(fresh)])
         assert 0 < len(fresh) <= len(beat.heard_clocks)
         answered += fresh
+
+
+def test_a_boot_whose_name_another_one_took_is_not_listed() -> None:
+    """So it learns that its messages are not accepted. One that is not verified yet, and one of our own name, have to
+    learn that they are heard."""
+    heartbeats = HeartbeatScheduler(random.Random(1), RATES, 0.0)
+
+    def session(number: int, name: str, *, verified: bool) -> Session:
+        made = Session(name, number.to_bytes(16, "little"), bytes(16), (KEY,), settings(name))
+        made.last_heard = 0.0
+        if verified:
+            made.transition(SessionEvent.VERIFIED)
+        return made
+
+    replaced, stranger, namesake = (
+        session(1, "b", verified=True),
+        session(2, "c", verified=False),
+        session(3, "a", verified=True),
+    )
+    beat = heartbeats.build(settings("a"), [replaced, stranger, namesake], (), 0, 0.0, 0.0)
+    assert set(beat.heard) == {stranger.heard_tag, namesake.heard_tag}
 
 
 def test_a_peer_has_no_sender_until_data_is_sent_to_it() -> None:

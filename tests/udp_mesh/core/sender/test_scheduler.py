@@ -8,7 +8,7 @@ from tests.udp_mesh.core.pair import World, pair, settings
 from udp_mesh.core.events import MessageId, MessageReceived, TopicStarved
 from udp_mesh.core.interfaces import Datagram
 from udp_mesh.core.sender.message import AcceptedMessage, OutgoingMessage, TopicChannel
-from udp_mesh.core.sender.scheduler import Scheduler
+from udp_mesh.core.sender.scheduler import Run, Scheduler
 from udp_mesh.core.settings import Topic
 from udp_mesh.wire.frames import MessageFlag
 
@@ -109,6 +109,63 @@ def test_other_levels_send_stale_and_fresh_messages_in_turn() -> None:
         scheduler.consume(run, 1)
         order.append(messages.index(run.message))
     assert order == [5, 0, 6, 1, 7, 2, 3, 4]
+
+
+def test_a_parked_message_returns_to_its_place_among_those_of_its_topic() -> None:
+    """In front of its level, behind earlier messages of its topic and before later ones."""
+
+    def message(number: int, channel: TopicChannel) -> OutgoingMessage:
+        accepted = AcceptedMessage(MessageId(number), channel, b"x", b"x", MessageFlag.RELIABLE, 0.0, None)
+        return OutgoingMessage(accepted, 9, reliable=True)
+
+    one, other = (TopicChannel(number, Topic("t", priority=9), f"t{number}", "") for number in range(2))
+    scheduler = Scheduler()
+    messages = {number: message(number, other if number == 5 else one) for number in range(1, 7)}
+    for number in (1, 2, 4, 5, 6):
+        scheduler.push(messages[number])
+    scheduler.restore(messages[3])
+    order = []
+    while (run := scheduler.peek(9)) is not None:
+        scheduler.consume(run, 1)
+        order.append(run.message.accepted.message_id)
+    assert order == [1, 2, 3, 4, 5, 6]
+    scheduler.push(messages[5])
+    scheduler.restore(messages[3])
+    first = scheduler.peek(9)
+    assert first is not None
+    assert first.message is messages[3]
+
+
+def test_a_level_fills_a_datagram_by_what_waits_on_it_now() -> None:
+    """Parking, restoring and sending keep account of it: else messages would wait for others that are here, or not wait
+    at all."""
+    scheduler = Scheduler()
+    messages = [outgoing(9, 1) for _ in range(4)]
+    scheduler.push(messages[0])
+    one_bytes = next(size for size in range(1, 200) if not scheduler.fills(9, size + 1))
+    for message in messages[1:]:
+        scheduler.push(message)
+
+    def waiting() -> int:
+        return next(count for count in range(5) if not scheduler.fills(9, count * one_bytes + 1))
+
+    def head() -> Run:
+        run = scheduler.peek(9)
+        assert run is not None
+        return run
+
+    assert waiting() == 4
+    parked = head().message
+    scheduler.park_head(head())
+    assert waiting() == 3
+    scheduler.restore(parked)
+    assert waiting() == 4
+    scheduler.consume(head(), 1)
+    assert waiting() == 3
+    scheduler.alternate_stale(5, -1.0)
+    assert waiting() == 3
+    scheduler.push_retransmit(messages[0], 0)
+    assert scheduler.fills(9, 1_000_000)
 
 
 def test_an_urgent_message_is_sent_next_in_the_middle_of_a_bulk_transfer() -> None:

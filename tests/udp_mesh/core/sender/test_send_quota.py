@@ -6,7 +6,15 @@ from __future__ import annotations
 import pytest
 
 from tests.udp_mesh.core.test_links import Run
-from udp_mesh.core.sender.send_quota import ASSUMED_DELIVERY_S, ack_spacing, cwnd_room, send_quota
+from udp_mesh.core.sender.send_quota import (
+    ASSUMED_DELIVERY_S,
+    LATE_AFTER_S,
+    ack_spacing,
+    cwnd_room,
+    next_send_at,
+    send_quota,
+)
+from udp_mesh.core.sender.send_state import SendState
 from udp_mesh.core.sender.sender import Sender
 from udp_mesh.core.settings import Settings
 
@@ -38,6 +46,25 @@ def test_assumed_delivery_is_bounded() -> None:
     capacity = sender.congestion.capacity_packets_per_s()
     assert capacity is not None
     assert room(sender, heard + 10.0) - room(sender, heard) <= ASSUMED_DELIVERY_S * capacity + 1
+
+
+def test_when_a_full_window_is_looked_at_again() -> None:
+    sender, heard = busy_outbound()
+    late_at = heard + max(LATE_AFTER_S, ack_spacing(sender) / (sender.congestion.capacity_packets_per_s() or 0.0))
+    quantum_s, rate = sender.rates.pace_quantum_s, sender.congestion.pacing_packets_per_s()
+    # While delivery is assumed, and not after: only an acknowledgment changes something then.
+    assert next_send_at(sender, 0, heard, rate) == pytest.approx(late_at + quantum_s)
+    now = late_at + ASSUMED_DELIVERY_S / 2
+    assert next_send_at(sender, 0, now, rate) == pytest.approx(now + quantum_s)
+    assert next_send_at(sender, 0, late_at + ASSUMED_DELIVERY_S + 0.001, rate) is None
+    # With room, when the pacer allows it.
+    sender.pacer.on_sent(10, heard, rate)
+    assert next_send_at(sender, 5, heard, rate) == sender.pacer.wake_at(rate)
+    # Once packets timed out, a timer would wake the process every few milliseconds of an outage.
+    sender.state = SendState.TIMING_OUT
+    assert next_send_at(sender, 0, now, rate) is None
+    sender.state = SendState.UNRESPONSIVE
+    assert next_send_at(sender, 5, now, rate) is None
 
 
 def test_no_delivery_is_assumed_on_a_link_with_a_foreign_queue() -> None:
