@@ -98,6 +98,7 @@ class FaultInjection:
                 (state.home / "clock").write_text(f"-{_TEN_YEARS_S}\n", encoding="ascii")
             case Fault.SSH_HANG:
                 state.hung = True
+                self._link_state.changed()
             case _:
                 assert_never(request.what)
 

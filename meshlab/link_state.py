@@ -221,10 +221,11 @@ class LinkState:
         self._graph = mesh_model.edges(nodes, self.links())
         self._base_routes = self._routes_from_base(self._graph)
         self._update_stations()
+        hung = frozenset(name for name, state in self._fleet.nodes.items() if state.hung)
         for name, state in self._fleet.nodes.items():
             routes = mesh_model.best_routes(self._graph, name) if name in nodes else {}
             text = mesh_model.heard_text(name, nodes, self._graph, routes, self._station_rows(name), self._passes)
-            text += mesh_model.servers_text(name, nodes, self._graph, self._logs_in)
+            text += mesh_model.servers_text(name, nodes, self._graph, self._logs_in, hung)
             if self._written.get(name) != text:
                 self._written[name] = text
                 _replace(state.home / "air" / "heard", text)

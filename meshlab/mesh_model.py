@@ -11,7 +11,7 @@ from __future__ import annotations
 import heapq
 import itertools
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from ipaddress import IPv4Interface, IPv4Network
 
@@ -275,16 +275,18 @@ def servers_text(
     nodes: Mapping[str, EffectiveState],
     graph: Mapping[str, list[Edge]],
     logs_in: Callable[[str, Edge], bool],
+    hung: Container[str] = (),
 ) -> str:
     """The rest of air/heard: L address state, of the SSH servers of the neighbors, for the stand-in of nc: `answers`,
-    `refused` by a firewall, or `silent`."""
+    `refused` by a firewall, `silent`, or `hangs` for a `hung` node, which accepts connections and says nothing."""
     states: dict[str, str] = {}
     for edge in graph.get(name, ()):
         if not edge.own.routes_with(edge.peer):
             continue
         for own in nodes[edge.node].addresses:
             if own.over_mesh and states.get(own.address) != "answers":
-                states[own.address] = "refused" if not own.admitted else "answers" if logs_in(name, edge) else "silent"
+                answer = "hangs" if edge.node in hung else "answers"
+                states[own.address] = "refused" if not own.admitted else answer if logs_in(name, edge) else "silent"
     return "".join(f"L\t{address}\t{state}\n" for address, state in states.items())
 
 
