@@ -81,6 +81,10 @@ def import_netbox(
 
     fleet = load_fleet(inventory, environ=os.environ)
     devices, interfaces = fetch(url, os.environ.get("NETBOX_TOKEN", ""), _filters(query or ()))
+    if not devices:
+        # as for every other selection: nothing is usually a typo
+        asked = f" matches {' '.join(f'--filter {word}' for word in query)}" if query else ""
+        raise InputError(f"{url}: no device{asked}", hint="see the list of devices in NetBox")
     place = f"{url.rstrip('/')}/dcim/devices"
     found = checked(netbox_rows(devices, interfaces, fleet), place)
     _take_over(inventory, fleet, found, place, add=add, new_in=file, dry_run=dry_run, as_json=as_json)

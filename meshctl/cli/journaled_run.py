@@ -133,11 +133,15 @@ def run_context(
     )
 
 
+# commands that are repeated with their arguments, as no other one takes them up
+_WITH_ARGUMENTS = ("restore", "replace")
+
+
 def retry_command(command: str, undoes: int | None = None) -> str:
     """The command that takes up what a run of `command` left; `undoes` is the run that a rollback takes back."""
     if undoes is not None:
         return f"meshctl rollback {undoes}"
-    return f"meshctl {command}" if command in ("restore", "replace") else "meshctl resume"
+    return f"meshctl {command}" if command in _WITH_ARGUMENTS else "meshctl resume"
 
 
 def print_totals(
@@ -156,5 +160,7 @@ def print_totals(
         else:
             echo(f"run {run.entry.id}: {counted}")
             if not counted.all_good:
-                echo(f"run `{retry}` for the unfinished {unfinished}", err=True)
+                again = retry in (f"meshctl {command}" for command in _WITH_ARGUMENTS)
+                what = f"repeat the same `{retry}`" if again else f"run `{retry}`"
+                echo(f"{what} for the unfinished {unfinished}", err=True)
     return typer.Exit(exit_for(run.outcomes.values(), opened.interrupt))

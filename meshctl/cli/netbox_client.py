@@ -60,8 +60,22 @@ def fetch(
         where = (
             "" if not asked or asked.startswith(url) else f" from {asked.partition('?')[0]}, to which {url} redirected"
         )
-        raise Unreachable(f"{url}: no answer{where}: {type(error).__name__}") from error
+        reason = next((text for kind, text in _failures(timeout_s) if isinstance(error, kind)), type(error).__name__)
+        hint = "check the address, and open it in a browser on this computer"
+        raise Unreachable(f"{url}: no answer{where}: {reason}", hint=hint) from error
     return devices, interfaces
+
+
+def _failures(timeout_s: float) -> tuple[tuple[type[Exception], str], ...]:
+    """What the errors of requests mean; a subclass stands before its base class."""
+    from requests import exceptions
+
+    return (
+        (exceptions.SSLError, "its certificate is not trusted on this computer"),
+        (exceptions.ConnectTimeout, f"cannot connect within {timeout_s:g} s"),
+        (exceptions.Timeout, f"nothing within {timeout_s:g} s"),
+        (exceptions.ConnectionError, "cannot connect, or the connection broke"),
+    )
 
 
 def _session(timeout_s: float) -> requests.Session:

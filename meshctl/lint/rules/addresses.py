@@ -269,9 +269,9 @@ def as_address(host: str) -> IpAddress | None:
 @fleet_rule(
     "MC214",
     Severity.ERROR,
-    "Two nodes have the same SSH host and port",
-    why="Each run would configure one device as both nodes in turn; only host key verification prevents it.",
-    fix="Remove `ssh.host` to use the node's own address, or give each node its own forwarded port.",
+    "Two devices have the same SSH host and port",
+    why="Each run would configure one device as both in turn; only host key verification prevents it.",
+    fix="Remove `ssh.host` to use the device's own address, or give each device its own forwarded port.",
     failing="""
     nodes:
       base: {ssh: {host: 127.0.0.1, port: 2201}}
@@ -284,13 +284,23 @@ def as_address(host: str) -> IpAddress | None:
     """,
 )
 def ssh_endpoint_twice(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    # nodes behind different jump hosts may share a host and port
-    endpoints = (
-        ((node.ssh.host, node.ssh.port, node.ssh.jump), node.name) for node in fleet.managed() if node.ssh.host
-    )
-    for (host, port, _), names in duplicates(endpoints):
-        for name in names[1:]:
-            path = ("nodes", name, "ssh", "host")
-            yield Finding(
-                path, f"{names[0]} has the same host and port", "a unique host and port", host_and_port(host, port)
-            )
+    # devices behind different jump hosts may share a host and port
+    for (host, port, _), devices in duplicates(_endpoints(fleet)):
+        owner = next((device for device in devices if not device[2]), devices[0])
+        for path, _, is_written in devices:
+            if is_written and path != owner[0]:
+                message = f"{owner[1]} has the same host and port"
+                yield Finding(path, message, "a unique host and port", host_and_port(host, port))
+
+
+def _endpoints(fleet: Fleet) -> Iterator[tuple[tuple[str, int, str], tuple[tuple[str, ...], str, bool]]]:
+    """Where each device accepts logins: the path of its `ssh.host`, what it is, and whether it has one."""
+    for node in fleet.managed():
+        ssh = node.ssh
+        place = ("nodes", node.name, "ssh", "host")
+        yield (ssh.host or str(node.address.ip), ssh.port, ssh.jump), (place, node.name, bool(ssh.host))
+    for robot in fleet.robots.values():
+        for key, what, computer in robot.all_computers():
+            ssh = computer.ssh
+            place = ("robots", robot.name, *key, "ssh", "host")
+            yield (ssh.host or str(computer.address.ip), ssh.port, ssh.jump), (place, what, bool(ssh.host))

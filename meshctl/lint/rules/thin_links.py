@@ -1,4 +1,4 @@
-"""Thin links: numbers, ports, the limits of their bands, and what topics offer on them (MC771 to MC778)."""
+"""Thin links: numbers, ports, the limits of their bands, and what topics offer on them (MC771 to MC779)."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ from collections.abc import Iterator
 
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
-from meshctl.lint.rule import Finding, fleet_rule
+from meshctl.lint.grouping import duplicates
+from meshctl.lint.rule import Example, Finding, fleet_rule
 from meshctl.lint.rules.references import suggest
 from meshctl.model import Fleet, ThinBand, ThinLink, Topic
 from meshctl.model.thin import BURST_SHARE, MAX_2400_MHZ_FRAME_BYTES, PART_OVERHEAD_BYTES
@@ -237,3 +238,34 @@ def robot_alone_on_thin_link(fleet: Fleet, _context: LintContext) -> Iterator[Fi
         if len(names) == 1 and link in fleet.udp_mesh.thin_links:
             path = ("robots", names[0], "thin", "ports", link)
             yield Finding(path, "no other robot is on this link", "at least two robots", f"{names[0]} alone")
+
+
+@fleet_rule(
+    "MC779",
+    Severity.ERROR,
+    "Two thin links of a robot have one serial port",
+    why="""The daemon reads and writes two links through one radio: the bytes of both are mixed, and neither carries a
+    message.""",
+    fix="Give each link the port of its own radio, best by its name in /dev/serial/by-id.",
+    failing=Example(
+        """
+        udp_mesh: {thin_links: {lora: {bits_per_s: 5470, band: eu869}, far: {bits_per_s: 5470, band: eu869}}}
+        robots:
+          base-station: {thin: {number: 1, ports: {lora: /dev/ttyUSB0, far: /dev/ttyUSB0}}}
+          husky1: {thin: {number: 2, ports: {lora: /dev/ttyUSB0, far: /dev/ttyUSB1}}}
+        """
+    ),
+    passing="""
+    udp_mesh: {thin_links: {lora: {bits_per_s: 5470, band: eu869}, far: {bits_per_s: 5470, band: eu869}}}
+    robots:
+      base-station: {thin: {number: 1, ports: {lora: /dev/ttyUSB0, far: /dev/ttyUSB1}}}
+      husky1: {thin: {number: 2, ports: {lora: /dev/ttyUSB0, far: /dev/ttyUSB1}}}
+    """,
+)
+def serial_port_twice(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for robot in fleet.robots.values():
+        ports = robot.thin.ports if robot.thin is not None else {}
+        for port, (first, *later) in duplicates((str(port), link) for link, port in ports.items()):
+            for link in later:
+                path = ("robots", robot.name, "thin", "ports", link)
+                yield Finding(path, f"{first} has the same port", "a port of its own", port)
