@@ -297,8 +297,8 @@ def _endpoints(fleet: Fleet) -> Iterator[tuple[tuple[str, int, str], tuple[tuple
     """Where each device accepts logins: the path of its `ssh.host`, what it is, and whether it has one."""
     for node in fleet.managed():
         ssh = node.ssh
-        place = ("nodes", node.name, "ssh", "host")
-        yield (ssh.host or str(node.address.ip), ssh.port, ssh.jump), (place, node.name, bool(ssh.host))
+        own = ("nodes", node.name, "ssh", "host")
+        yield (ssh.host or str(node.address.ip), ssh.port, ssh.jump), (own, node.name, bool(ssh.host))
     for robot in fleet.robots.values():
         for key, what, computer in robot.all_computers():
             ssh = computer.ssh
