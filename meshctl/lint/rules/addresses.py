@@ -302,5 +302,5 @@ def _endpoints(fleet: Fleet) -> Iterator[tuple[tuple[str, int, str], tuple[tuple
     for robot in fleet.robots.values():
         for key, what, computer in robot.all_computers():
             ssh = computer.ssh
-            place = ("robots", robot.name, *key, "ssh", "host")
-            yield (ssh.host or str(computer.address.ip), ssh.port, ssh.jump), (place, what, bool(ssh.host))
+            path = ("robots", robot.name, *key, "ssh", "host")
+            yield (ssh.host or str(computer.address.ip), ssh.port, ssh.jump), (path, what, bool(ssh.host))
