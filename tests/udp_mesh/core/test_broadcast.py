@@ -272,3 +272,18 @@ def test_a_sender_whose_numbers_keep_jumping_ahead_causes_few_requests() -> None
         repairs.on_counter(1000 * jump, 0.0, RangeSet())
     requested = [nack.message_id for nack in repairs.due_nacks(1.0)]
     assert requested == list(range(99_000 - MAX_MISSING, 99_000))
+
+
+def test_broadcasts_that_are_not_urgent_are_spread_over_time() -> None:
+    """Radios send them at their lowest rate: many at once would fill the air."""
+    both = pair(Topic("news", priority=9), rates=Rates(broadcast_packets_per_s=100.0))
+    for number in range(30):
+        both.a.send("news", b"%d" % number, now=both.now)
+    sent: list[float] = []
+    begin = both.now
+    while len(sent) < 30:
+        assert both.now < begin + 1.0
+        sent += [both.now - begin for datagram in both.drop(both.a) if datagram.destination == BROADCAST]
+        both.now += 0.001
+    assert sent.count(sent[0]) <= 2
+    assert sent[-1] >= 0.27
