@@ -28,6 +28,7 @@ from meshctl.lint.rules import (
     hardware,
     housekeeping,
     identity,
+    inventory_files,
     legacy,
     mtu,
     networks,
@@ -58,6 +59,7 @@ from meshctl.lint.rules import (
 CHAPTERS: tuple[tuple[str, ModuleType], ...] = (
     ("Suppressions and the baseline", housekeeping),
     ("Typing", typography),
+    ("Files of the inventory", inventory_files),
     ("References", references),
     ("Sites", sites),
     ("Identity", identity),

@@ -30,6 +30,9 @@ class Files(Protocol):
     def is_special(self, path: Path) -> bool:
         """Whether the path exists but is not a regular file."""
 
+    def inside(self, folder: Path) -> tuple[Path, ...]:
+        """The regular files directly in a folder, by name; none if there are very many."""
+
     def in_repository(self, path: Path) -> bool:
         """Whether git would commit the file: it is inside a work tree, and not ignored."""
 

@@ -6,6 +6,7 @@ import os
 import shutil
 import stat
 import subprocess
+from itertools import islice
 from pathlib import Path
 
 from meshctl import firmware
@@ -14,6 +15,8 @@ from meshctl.model import HardwareProfile
 
 # 10,000 pinned keys take about 4 MB
 _MAX_TEXT_BYTES = 16 * 1024 * 1024
+# a home directory, or a folder of logs, is not one of an inventory
+_MAX_ENTRIES = 1000
 # git answers immediately, or hangs on an unavailable network file system
 _GIT_TIMEOUT_S = 10
 
@@ -51,6 +54,14 @@ class DiskFiles:
             return path.read_text(encoding="utf-8", errors="replace")
         except OSError:
             return None
+
+    def inside(self, folder: Path) -> tuple[Path, ...]:
+        try:
+            with os.scandir(folder) as entries:
+                found = [entry.name for entry in islice(entries, _MAX_ENTRIES + 1) if entry.is_file()]
+        except (OSError, ValueError):
+            return ()
+        return tuple(folder / name for name in sorted(found)) if len(found) <= _MAX_ENTRIES else ()
 
     def in_repository(self, path: Path) -> bool:
         if path not in self._tracked:
