@@ -67,7 +67,7 @@ def test_options_before_the_command_are_answered_with_the_right_order() -> None:
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (("history", "x"), "Invalid value for 'run': expected a whole number, found 'x'"),
+        (("history", "--limit", "x"), "Invalid value for '--limit' / '-n': expected a whole number, found 'x'"),
         (("history", "--limit", "0"), "expected a value greater than or equal to 1, found '0'"),
         (("status", "--watch", "often"), "expected a number, found 'often'"),
         (("inventory", "state", "b01", "gone"), "Invalid value for 'new': 'gone' is not one of 'carried', 'deployed'"),
