@@ -43,8 +43,9 @@ MEANING = {
     "unreachable": OLD | NEW,
     "uncertain": OLD | NEW,
 }
-# What may stay in /tmp/meshctl: the lock's number, the switch's own FIFO, and of its last reload the script's output.
-KEPT = re.compile(r"lock\.\d+|pause|reload\.(log|pid|members)|reloaded|extra\.log")
+# What may stay in /tmp/meshctl: the lock's number, the switch's own FIFO, and of its last reload the script's output
+# and the numbers of its processes.
+KEPT = re.compile(r"lock\.\d+|pause|reload\.(log|pid|waits|members)|reloaded|extra\.log")
 BACKUP_NAME = re.compile(r"(.+)-\d{8}T\d{6}Z\.tgz")
 
 
