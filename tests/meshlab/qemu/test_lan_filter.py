@@ -17,7 +17,7 @@ from tests.meshlab.qemu.conftest import Lab, until
 pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("lab-real"), pytest.mark.timeout(1800)]
 
 RADIOS = ("husky-front", "husky-rear")
-# a VLP-16's packets to its factory destination: 1206 bytes, at 10 Mbit/s
+# a VLP-16's packets to its factory destination: 1206 bytes
 _LIDAR = """
 cat >/run/lidar.py <<'END'
 import socket, time
@@ -26,7 +26,7 @@ out.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
 out.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, b"eth0")
 start, sent = time.monotonic(), 0
 while True:
-    while sent < (time.monotonic() - start) * 1e7 / 8 / 1206:
+    while sent < (time.monotonic() - start) * BITS_PER_S / 8 / 1206:
         out.sendto(bytes(1206), ("255.255.255.255", 2368))
         sent += 1
     time.sleep(0.005)
@@ -49,6 +49,11 @@ while True:
 END
 ip netns exec pc.base-station python3 /run/heard.py >/dev/null 2>&1 </dev/null & echo $! >/run/heard.pid
 """
+
+
+def lidar(bits_per_s: float) -> str:
+    """The command that starts it."""
+    return _LIDAR.replace("BITS_PER_S", f"{bits_per_s:g}")
 
 
 @contextmanager
@@ -85,15 +90,17 @@ def test_a_lidars_broadcasts_stay_on_the_robot_and_unicast_passes(lab: Lab) -> N
     try:
         with process(lab, _LISTENER, "heard"):
             until(lambda: heard_at_base(lab) is not None, "the base station's computer to listen")
-            with process(lab, _LIDAR, "lidar"):
+            with process(lab, lidar(10e6), "lidar"):
                 until(
                     lambda: all(now - then > 500 for now, then in zip(dropped(lab), before, strict=True)),
                     "both filters to drop 500 frames",
                 )
                 until(lambda: lab.answers("husky", "10.42.0.2"), "the base station to answer beside the lidar")
                 assert heard_at_base(lab) == 0
-                for name in RADIOS:
-                    lab.on(name, "nft delete table bridge meshctl_lan")
+            for name in RADIOS:
+                lab.on(name, "nft delete table bridge meshctl_lan")
+            # on a busy host the mesh carries little of 10 Mbit/s, and what waits would fill the machine's memory
+            with process(lab, lidar(0.5e6), "lidar"):
                 until(lambda: (heard_at_base(lab) or 0) > 50, "the lidar to be heard without the filters")
     finally:
         for name in RADIOS:
