@@ -18,11 +18,11 @@ from meshctl.apply.change_set import change_of, new_change_id, new_nonce, radios
 from meshctl.apply.context import NodeContext
 from meshctl.apply.health_checks import RELOADING, unmet
 from meshctl.apply.next_action import Action, applied_age_s, next_action
+from meshctl.deadline import deadline
 from meshctl.device import deadman
 from meshctl.device.connection import Deadlines, Endpoint
 from meshctl.device.deadman import Change, Payload
 from meshctl.device.errors import AuthenticationRefused, CommandFailed, NodeRefused
-from meshctl.device.liveness import deadline
 from meshctl.device.observation import ChangeStatus, Observation
 from meshctl.device.observe import observe
 from meshctl.device.openwrt import is_first_boot

@@ -45,8 +45,8 @@ from meshctl.apply.stale_stations import (
     routed_through,
     watch_script,
 )
+from meshctl.deadline import deadline
 from meshctl.device.connection import Deadlines
-from meshctl.device.liveness import deadline
 from meshctl.device.observation import Observation
 from meshctl.device.ssh import SshConnection
 from meshctl.errors import NodeError

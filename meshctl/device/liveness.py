@@ -107,20 +107,6 @@ def keepalives(transport: paramiko.Transport, every_s: float, idle_s: float) -> 
             transport.set_keepalive(int(idle_s))
 
 
-@contextmanager
-def deadline(seconds: float, act: Callable[[], object]) -> Iterator[None]:
-    """Call `act` in another thread if this block takes longer. After the block, `act` has ended, or never runs."""
-    timer = threading.Timer(seconds, act)
-    timer.daemon = True
-    timer.start()
-    try:
-        yield
-    finally:
-        # canceling does not stop a timer that has just fired, which would act on what is done next
-        timer.cancel()
-        timer.join()
-
-
 class Watchdog:
     """Closes `transport` when this block takes longer than `seconds` (`timed_out`), or when `activity` shows no data
     for `silence_s` (`silent`). All of them share one thread (`_WatchdogThread`)."""

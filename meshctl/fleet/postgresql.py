@@ -18,9 +18,10 @@ import socket
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Any
 
+from meshctl.deadline import deadline
 from meshctl.errors import InputError, MeshctlError
 
 if TYPE_CHECKING:
@@ -201,16 +202,9 @@ class Database:
     def _errors(self, verb: str) -> Iterator[None]:
         import psycopg
 
-        watchdog = threading.Timer(ANSWER_TIMEOUT_S, _hang_up, (self._connection,))
-        watchdog.daemon = True
-        watchdog.start()
         try:
-            try:
+            with deadline(ANSWER_TIMEOUT_S, partial(_hang_up, self._connection)):
                 yield
-            finally:
-                watchdog.cancel()
-                # one that has just fired would end a later query
-                watchdog.join()
         except psycopg.Error as error:
             if self._connection.broken or self._connection.closed or isinstance(error, psycopg.errors.AdminShutdown):
                 raise DatabaseLost(f"{self.label}: the connection was lost: {_one_line(error)}") from error
