@@ -165,22 +165,19 @@ class BusyTeam(RandomTeam):
             super()._wake(name, node, at)
 
     def _arrive(self, name: str, network: SimNetwork, data: bytes, source: Address) -> None:
-        if not network.up:
-            return
-        waiting = self._waiting.get(name)
-        if waiting is None:
-            self._receive(name, Waiting(data, network.name, source, self.now), self.clock(name))
-            self.pump(name)
-        elif len(waiting) < MAX_WAITING_DATAGRAMS:
-            waiting.append(Waiting(data, network.name, source, self.now))
+        if network.up:
+            self._arrive_now(name, Waiting(data, network.name, source, self.now))
 
     def _arrive_by_radio(self, name: str, frame: bytes) -> None:
+        self._arrive_now(name, Waiting(frame, RADIO.name, ("", 0), self.now))
+
+    def _arrive_now(self, name: str, datagram: Waiting) -> None:
         waiting = self._waiting.get(name)
         if waiting is None:
-            self._receive(name, Waiting(frame, RADIO.name, ("", 0), self.now), self.clock(name))
+            self._receive(name, datagram, self.clock(name))
             self.pump(name)
         elif len(waiting) < MAX_WAITING_DATAGRAMS:
-            waiting.append(Waiting(frame, RADIO.name, ("", 0), self.now))
+            waiting.append(datagram)
 
     def _receive(self, name: str, datagram: Waiting, now: float) -> None:
         if name == OLD:
