@@ -20,6 +20,12 @@ _GATEWAY = """
     """
 
 
+_REPORTED_HERE = (
+    *("MC005", "MC006", "MC122", "MC214", "MC238", "MC434", "MC435"),
+    *("MC610", "MC726", "MC833", "MC837", "MC918", "MC921"),
+)
+
+
 def _found(fragment: str, directory: Path) -> list[Diagnostic]:
     example = Example(fragment)
     return list(check_path(write(example, directory), _REGDB, environment(example)).diagnostics)
@@ -116,20 +122,7 @@ def test_a_mistake_is_found_at_its_place(fragment: str, code: str, path: str, ex
 )
 def test_what_is_sound_is_not_reported(fragment: str, tmp_path: Path) -> None:
     codes = {item.code for item in _found(fragment, tmp_path)}
-    assert not codes & {
-        "MC005",
-        "MC006",
-        "MC122",
-        "MC214",
-        "MC238",
-        "MC434",
-        "MC435",
-        "MC610",
-        "MC726",
-        "MC833",
-        "MC837",
-    }
-    assert not codes & {"MC918", "MC921"}
+    assert codes.isdisjoint(_REPORTED_HERE)
 
 
 @pytest.mark.parametrize(
