@@ -1,4 +1,4 @@
-"""Thin links: numbers, ports, the limits of their bands, and what topics offer on them (MC771 to MC779)."""
+"""Thin links: numbers, ports, the limits of their bands, and what topics offer on them (MC771 to MC780)."""
 
 from __future__ import annotations
 
@@ -269,3 +269,38 @@ def serial_port_twice(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
             for link in later:
                 path = ("robots", robot.name, "thin", "ports", link)
                 yield Finding(path, f"{first} has the same port", "a port of its own", port)
+
+
+@fleet_rule(
+    "MC780",
+    Severity.ERROR,
+    "A robot's name does not fit the frames of its thin link",
+    why="""A robot introduces itself on a thin link with its name in one frame. The daemon refuses a name that does not
+    fit, and does not start.""",
+    fix="Choose a shorter name, larger frames (`frame_bytes`), or a faster air rate where a band limits them.",
+    failing="""
+    udp_mesh: {thin_links: {lora: {bits_per_s: 5470, band: eu869, frame_bytes: 40}}}
+    nodes: {rescue: {role: robot, state: carried, address: 10.42.0.12, label: R1}}
+    robots:
+      base-station: {thin: {number: 1, ports: {lora: /dev/ttyUSB0}}}
+      search-and-rescue: {nodes: [rescue], thin: {number: 2, ports: {lora: /dev/ttyUSB0}}}
+    """,
+    passing="""
+    udp_mesh: {thin_links: {lora: {bits_per_s: 5470, band: eu869, frame_bytes: 60}}}
+    nodes: {rescue: {role: robot, state: carried, address: 10.42.0.12, label: R1}}
+    robots:
+      base-station: {thin: {number: 1, ports: {lora: /dev/ttyUSB0}}}
+      search-and-rescue: {nodes: [rescue], thin: {number: 2, ports: {lora: /dev/ttyUSB0}}}
+    """,
+)
+def name_beyond_frame(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    links = fleet.udp_mesh.thin_links
+    for robot in fleet.robots.values():
+        ports = robot.thin.ports if robot.thin is not None else ()
+        for name in ports:
+            if name not in links or any(frame_problems(links[name])):
+                continue
+            length, limit = len(robot.name.encode()), links[name].longest_name_bytes
+            if length > limit:
+                text = f"frames of {name} have {links[name].largest_frame_bytes} bytes"
+                yield Finding(("robots", robot.name), text, f"a name of at most {limit} bytes", f"{length} bytes")
