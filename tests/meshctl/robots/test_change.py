@@ -11,9 +11,6 @@ from meshctl.inventory import load_fleet
 from tests.meshctl.device.servers import eventually
 from tests.meshctl.robots.fleets import RobotFleet
 
-# the first one may have to wait until the machines are built
-pytestmark = pytest.mark.timeout(600)
-
 
 def _boots(fleet: RobotFleet) -> dict[str, str]:
     return {name: one["status"].get("boot", "") for name, one in fleet.status().items()}

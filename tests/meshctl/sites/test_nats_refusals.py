@@ -28,7 +28,7 @@ from tests.meshctl.monitor.prometheus_program import free_tcp_port
 from tests.meshctl.sites.nats_servers import NatsServerProcess
 from tests.waiting import until
 
-pytestmark = [pytest.mark.xdist_group("nats"), pytest.mark.timeout(120)]
+pytestmark = [pytest.mark.xdist_group("nats")]
 _NORTH = SiteSubjects("mines", "north")
 _DENIED = (_NORTH.ask, "$JS.API.STREAM.CREATE.>", "_INBOX.refused.>")
 INVENTORY = """\
