@@ -152,6 +152,12 @@ class BusyTeam(RandomTeam):
         self._waiting.pop(name, None)
         super().start(name)
 
+    def kill(self, name: str, *, politely: bool = False) -> None:
+        # a daemon that is asked to end does so once its computer lets it run
+        if politely and name in self._waiting:
+            self._catch_up(name, self.nodes[name])
+        super().kill(name, politely=politely)
+
     def pump(self, name: str) -> None:
         if name not in self._waiting:
             super().pump(name)

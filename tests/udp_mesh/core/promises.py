@@ -236,7 +236,8 @@ def play(seed: int, seconds: float, kind: type[RandomTeam] = RandomTeam) -> Rand
         return team
 
 
-def main() -> None:
+def main() -> int:
+    """1 if a seed failed."""
     parser = argparse.ArgumentParser(prog="python -m tests.udp_mesh.core.promises", description=__doc__)
     parser.add_argument("first", type=int)
     parser.add_argument("last", type=int)
@@ -254,7 +255,8 @@ def main() -> None:
             sys.stdout.write(f"seed {seed}: {type(error).__name__}: {str(error)[:600]}\n")
             sys.stdout.flush()
     sys.stdout.write(f"{failed} of {arguments.last - arguments.first} seeds failed\n")
+    return min(failed, 1)
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())
