@@ -18,7 +18,7 @@ from udp_mesh.core.endpoint import Endpoint
 from udp_mesh.core.interfaces import Datagram
 from udp_mesh.core.settings import Address, Neighbour, Settings, Topic
 from udp_mesh.core.thin.settings import ThinLinkSettings, ThinSettings
-from udp_mesh.daemon.driver import MAX_DRAIN_DATAGRAMS, MAX_DRAIN_S
+from udp_mesh.daemon.driver import MAX_DRAIN_DATAGRAMS
 from udp_mesh.sim.thin_medium import ThinMedium
 from udp_mesh.sim.topology import SimNetwork
 from udp_mesh.wire.legacy import PriorityMeshData
@@ -204,13 +204,12 @@ class BusyTeam(RandomTeam):
             return
         waiting = self._waiting.pop(name)
         # Of the kernel; after the wall clock was set they are wrong, and limited by the driver.
-        shift_s = self.dice.choice((0.0, 0.0, 0.0, MAX_DRAIN_S, -0.3, float("inf")))
+        shift_s = self.dice.choice((0.0, 0.0, 0.0, 0.5, -0.3, float("inf")))
         now = 0.0
         while waiting:
             for _ in range(min(len(waiting), MAX_DRAIN_DATAGRAMS)):
                 datagram = waiting.popleft()
-                at = datagram.arrived_at + shift_s
-                at = self.now if at > self.now + MAX_DRAIN_S else at
+                at = min(datagram.arrived_at + shift_s, self.now)
                 # the legacy program takes its own time, when it reads
                 now = max(now, self.now if name == OLD else at)
                 self._receive(name, datagram, self.clocks.get(name, 0.0) + now)

@@ -83,8 +83,7 @@ class Forwarding:
             link = None if neighbor is None else neighbor.best_link(own_round, now)
             if neighbor is None or link is None:
                 continue
-            # a time of arrival is the kernel's, by a clock that may have been set since
-            delay_us = min((1 << 24) - 1, int(max(0.0, now - neighbor.largest_at) * 1e6))
+            delay_us = min((1 << 24) - 1, int((now - neighbor.largest_at) * 1e6))
             _, data = self._channels.seal(neighbor.hop, encode_hop_ack(HopAck(neighbor.largest, delay_us)))
             neighbor.unacknowledged, neighbor.ack_at = 0, _NEVER
             out.append(Datagram(link.name, link.address, data, True))

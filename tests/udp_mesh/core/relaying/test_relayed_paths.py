@@ -236,15 +236,3 @@ def test_what_is_sent_to_a_node_whose_only_relay_died_is_counted_and_leaves_on_n
     assert relaying(topology, "base").counters.dropped_unreachable > before
     topology.add(node("husky", RelaySettings(("uav",))), ["mesh"])
     assert topology.run(20, lambda: len(reported(topology, "uav", MessageReceived)) == 1)
-
-
-def test_a_datagram_that_seems_to_arrive_later_than_now_is_acknowledged() -> None:
-    topology = chain(3)
-    topology.run(4)
-    relay = topology.nodes["n2"]
-    forwarding = relay._relaying.forwarding
-    for boot_id, neighbor in forwarding.neighbors.items():
-        neighbor.largest_at, neighbor.ack_at = topology.now + 0.4, topology.now
-        forwarding.ack_due[boot_id] = None
-    assert len(relay.datagrams_to_send(topology.now)) >= 2
-    assert not forwarding.ack_due
