@@ -164,6 +164,8 @@ class DirectoryStore:
         path = self._path(key)
         try:
             path.unlink(missing_ok=True)
+        except NotADirectoryError:
+            return True
         except OSError as error:
             self._log("outbox-remove-failed", f"path={path} error={error}")
             return False
