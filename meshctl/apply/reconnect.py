@@ -16,13 +16,21 @@ from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass
 
 from meshctl.apply.context import RunContext
-from meshctl.apply.stale_stations import CAUGHT_UP, GONE, MAX_QUERIED, StationEntry, inventory_login, reconnect_script
+from meshctl.apply.stale_stations import (
+    CAUGHT_UP,
+    GONE,
+    MAX_QUERIED,
+    LoginPlace,
+    StationEntry,
+    inventory_login,
+    reconnect_script,
+)
 from meshctl.device.observation import Observation
 from meshctl.device.ssh import SshConnection
 from meshctl.errors import NodeError
 from meshctl.fleet import Event, EventKind, Interrupt, Observer, silent
 from meshctl.fleet.journal import LastKnown
-from meshctl.model import Fleet
+from meshctl.model import Fleet, Node
 from meshctl.nodes.collect import FleetObservation
 from meshctl.nodes.connections import ConnectionPool
 from meshctl.topology import mesh_macs
@@ -67,12 +75,13 @@ def reconnect(
     if not asked:
         return Reconnected()
     in_use: list[SshConnection] = []
-    logins = {mac: inventory_login(fleet.nodes[name]) for mac, name in owners.items() if name in fleet.nodes}
+    logins = {mac: _logins(fleet.nodes[name], connections) for mac, name in owners.items() if name in fleet.nodes}
 
     def ask(holder: str) -> str | None:
         entries = asked[holder]
         script = reconnect_script(entries, caught_up=MAX_CAUGHT_UP, logins=logins)
-        timeout_s = QUERY_TIMEOUT_S + ENTRY_TIMEOUT_S * len(entries)
+        checks = sum(len(logins.get(entry.mac.lower(), ())) or 1 for entry in entries)
+        timeout_s = QUERY_TIMEOUT_S + ENTRY_TIMEOUT_S * checks
         timeout_s += CATCH_UP_TIMEOUT_S * min(len(entries), MAX_CAUGHT_UP)
         doing = f"repairs its links to nodes that do not answer (at most {timeout_s:.0f} s)"
         observer(Event(EventKind.STEP, holder, time.time(), doing))
@@ -98,6 +107,13 @@ def reconnect(
         return repaired(
             {name: answer.result() for name, answer in answers.items()}, asked, observed.unreachable, owners
         )
+
+
+def _logins(node: Node, connections: ConnectionPool) -> tuple[LoginPlace, ...]:
+    """Where a node may accept logins: according to the inventory, and where it was last seen, if that differs."""
+    former = connections.former_places().get(node.name)
+    seen = () if former is None else (LoginPlace(str(former.address), former.port),)
+    return tuple(dict.fromkeys((inventory_login(node), *seen)))
 
 
 def reach_behind(run_context: RunContext, node: str, now: Observation, names: Iterable[str]) -> frozenset[str]:

@@ -220,14 +220,17 @@ def _where(login: LoginPlace | None) -> str:
     return f" {quoted(login.address)} {login.port}{announced}"
 
 
-def reconnect_script(entries: Sequence[StationEntry], *, caught_up: int, logins: Mapping[str, LoginPlace]) -> str:
+def reconnect_script(
+    entries: Sequence[StationEntry], *, caught_up: int, logins: Mapping[str, Sequence[LoginPlace]]
+) -> str:
     """POSIX sh that repairs a holder's links to these neighbors: it removes stale entries, then sends to the first
     `caught_up` of those that still do not answer. It prints a line for each of both. `logins`: lower-case MAC -> where
-    its node accepts logins."""
+    its node may accept logins; an address that no device has shows nothing."""
     words = [(quoted(entry.ifname), quoted(entry.mac)) for entry in entries]
     flushes = [
-        f"flush_stale {ifname} {mac} 0{_where(logins.get(entry.mac.lower()))}\n"
+        f"flush_stale {ifname} {mac} 0{_where(login)}\n"
         for (ifname, mac), entry in zip(words, entries, strict=True)
+        for login in logins.get(entry.mac.lower()) or (None,)
     ]
     sends = [f"catch_up {ifname} {mac}\n" for ifname, mac in words[:caught_up]]
     return "".join((script("stale_station.sh"), *flushes, f"pause {RELEARN_S}\n", *sends))

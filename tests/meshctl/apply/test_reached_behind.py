@@ -32,6 +32,7 @@ class Chain(Neighbors):
         work.observer = lambda _: None
         work.note = lambda text, name="": self.notes.append(text if not name else f"{name}: {text}")
         work.connections.borrow = self._borrow
+        work.connections.former_places = dict
 
     @contextmanager
     def _borrow(self, there: SimpleNamespace) -> Iterator[SimpleNamespace]:

@@ -6,6 +6,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from ipaddress import ip_address
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -24,7 +25,7 @@ from meshctl.device.observation import Station
 from meshctl.fleet import Event, EventKind, Interrupt
 from meshctl.fleet.journal import LastKnown
 from meshctl.nodes.collect import FleetObservation
-from meshctl.nodes.connections import ConnectionPool
+from meshctl.nodes.connections import ConnectionPool, SshAddress
 from tests.meshctl.apply.mesh_nodes import MAC, MACS, OTHER, node
 from tests.meshctl.plan.support import fleet, running
 
@@ -65,15 +66,20 @@ def test_an_interrupt_need_not_wait_for_neighbors_that_repair_their_links(when: 
     heard = Station("mesh0", MAC, inactive_ms=200, connected_s=500)
     around = {"b01": replace(running(fleet(), "b01", neighbors=()), stations=(heard,))}
     seen = FleetObservation(around, {"b02": "no answer"})
-    pool = cast(ConnectionPool, SimpleNamespace(borrow=borrow))
+    pool = cast(ConnectionPool, SimpleNamespace(borrow=borrow, former_places=dict))
     reconnect(pool, fleet(), seen, {MAC: "b02"}, interrupt=interrupt, observer=observer)
     assert [(event.kind, event.node) for event in events] == [(EventKind.STEP, "b01"), (EventKind.FINISHED, "b01")]
     assert events[0].text.startswith("repairs its links to nodes that do not answer (at most ")
 
 
-def test_a_node_that_does_not_answer_has_its_ssh_server_tried_by_its_neighbors() -> None:
-    """It may answer their echo requests, which are of another traffic class (finding 25 of node-assumptions.md)."""
+@pytest.mark.parametrize("former", [None, "10.42.0.99", "its own"])
+def test_a_node_that_does_not_answer_has_its_ssh_server_tried_by_its_neighbors(former: str | None) -> None:
+    """It may answer their echo requests, which are of another traffic class (finding 25 of node-assumptions.md). If the
+    inventory gives it another address or port, it still listens where it was last seen."""
     scripts: list[str] = []
+    b02 = fleet().nodes["b02"]
+    own = SshAddress(b02.address.ip, b02.ssh.port)
+    places = {} if former is None else {"b02": own if former == "its own" else SshAddress(ip_address(former), 2222)}
 
     def run(script: str, *, timeout_s: float) -> Any:
         scripts.append(script)
@@ -85,12 +91,13 @@ def test_a_node_that_does_not_answer_has_its_ssh_server_tried_by_its_neighbors()
 
     heard = Station("mesh0", MAC, inactive_ms=200, connected_s=500)
     around = {"b01": replace(running(fleet(), "b01", neighbors=()), stations=(heard,))}
-    pool = cast(ConnectionPool, SimpleNamespace(borrow=borrow))
+    pool = cast(ConnectionPool, SimpleNamespace(borrow=borrow, former_places=lambda: places))
     seen = FleetObservation(around, {"b02": "no answer"})
     assert reconnect(pool, fleet(), seen, {MAC: "b02"}, interrupt=Interrupt()).nodes == {"b02"}
     (script,) = scripts
-    b02 = fleet().nodes["b02"]
-    assert f"\nflush_stale mesh0 {MAC} 0 {b02.address.ip} {b02.ssh.port}\n" in script
+    calls = [line for line in script.splitlines() if line.startswith("flush_stale mesh0 ")]
+    elsewhere = [f"flush_stale mesh0 {MAC} 0 {former} 2222"] if former == "10.42.0.99" else []
+    assert calls == [f"flush_stale mesh0 {MAC} 0 {b02.address.ip} {b02.ssh.port}", *elsewhere]
 
 
 def test_only_neighbors_that_hear_an_unreachable_node_now_are_asked_for_stale_entries() -> None:

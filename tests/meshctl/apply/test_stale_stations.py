@@ -368,7 +368,7 @@ def test_a_neighbor_that_drops_frames_until_their_numbers_catch_up_is_sent_enoug
 
 def test_only_where_the_node_of_a_radio_is_known_its_ssh_server_is_tried() -> None:
     entries = [StationEntry("b01", "mesh0", MAC.upper()), StationEntry("b01", "mesh0", OTHER)]
-    text = reconnect_script(entries, caught_up=0, logins={MAC: LoginPlace("10.42.0.11", 2222)})
+    text = reconnect_script(entries, caught_up=0, logins={MAC: (LoginPlace("10.42.0.11", 2222),)})
     calls = [line for line in text.splitlines() if line.startswith("flush_stale ")]
     assert calls == [f"flush_stale mesh0 {MAC.upper()} 0 10.42.0.11 2222", f"flush_stale mesh0 {OTHER} 0"]
 
