@@ -69,6 +69,9 @@ def up(
     if copy.kept is not None:
         echo(f"kept:      {copy.kept}, the earlier copy of the inventory, which was edited")
     echo(f"inventory: {copy.inventory}")
+    if copy.hosts:
+        computers = counted(len(copy.hosts), "computer")
+        echo(f"removed:   ssh.host of {computers}, in this copy only: no command reaches the real robots")
     lab, inventory_path = shlex.quote(str(place)), shlex.quote(str(copy.inventory))
     echo(f"use it:    export MESHCTL_LAB={lab} MESHCTL_INVENTORY={inventory_path}")
     echo(f"console:   meshctl lab shell {fleet.spec.names[0]}")
