@@ -314,10 +314,10 @@ def radio_path_twice(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
 )
 def power_in_watts(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for profile in fleet.hardware.values():
-        for radio in profile.radios:
-            if radio.rated_power_dbm < _MIN_PLAUSIBLE_DBM:
-                path = ("hardware", profile.name, "radios", radio.name, "rated_power_dbm")
-                yield Finding(path, "not a plausible power in dBm", "at least 5", _dbm(radio.rated_power_dbm))
+        for built_in in profile.radios:
+            if built_in.rated_power_dbm < _MIN_PLAUSIBLE_DBM:
+                rating = ("hardware", profile.name, "radios", built_in.name, "rated_power_dbm")
+                yield Finding(rating, "not a plausible power in dBm", "at least 5", _dbm(built_in.rated_power_dbm))
     for node, radio, _ in _transmitting(fleet):
         if radio.tx_power_dbm < _MIN_PLAUSIBLE_DBM:
             path = _drive_path(fleet, node, radio)
