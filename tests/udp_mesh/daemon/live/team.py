@@ -145,6 +145,9 @@ class LiveTeam:
     def close_reader(self, name: str) -> None:
         robot = self.robots[name]
         if robot.reader is not None:
+            # what is in the socket of a program without receipts counts as taken, also while it pauses
+            robot.reader.paused_until = 0.0
+            self._read(name, robot)
             robot.reader.close()
             self.excused |= {(name, key) for key in robot.reader.unacknowledged}
             robot.reader = None
@@ -216,9 +219,7 @@ class LiveTeam:
             if robot.daemon.process is not None and (code := robot.daemon.process.poll()) is not None:
                 raise Broken(f"{robot.name} ended by itself with {code}: {robot.daemon.log.read_text()[-3000:]}")
         for name, robot in self.robots.items():
-            if robot.reader is not None:
-                for header, key in robot.reader.poll():
-                    self._on_message(name, robot, header, key)
+            self._read(name, robot)
             if robot.writer is not None:
                 for sent, header in robot.writer.poll():
                     self._on_outcome(sent, header)
@@ -227,6 +228,10 @@ class LiveTeam:
             if known is None or (known.source, known.topic) != (taken.source, taken.topic):
                 raise Broken(f"the legacy robot received {taken}, which was {known}")
             self.received[LEGACY].add(taken.key)
+
+    def _read(self, name: str, robot: Robot) -> None:
+        for header, key in robot.reader.poll() if robot.reader is not None else ():
+            self._on_message(name, robot, header, key)
 
     def _on_message(self, name: str, robot: Robot, header: dict[str, object], key: bytes) -> None:
         sent = self.sent.get(key)
