@@ -1,4 +1,4 @@
-"""Transmit power: hardware limits, regulatory limits, asymmetric links (MC341 to MC350)."""
+"""Transmit power: hardware limits, regulatory limits, asymmetric links (MC341 to MC351)."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ from meshctl.lint.rule import Finding, fleet_rule
 from meshctl.model import AntennaKind, Fleet, Mesh, Node, Radio
 from meshctl.regdb import CHANNELS, check_span, primary_span
 
+# below this, a radio reaches the next room; 0 is "automatic" in other firmware
+_LEAST_DBM = 4
 # 47 CFR 15.247(b)(3), (b)(4), and the same in RSS-247 5.4(d): digital modulation at 2400-2483.5 and 5725-5850 MHz
 _CONDUCTED_LIMIT_DBM = 30.0
 _FREE_GAIN_DBI = 6.0
@@ -298,3 +300,20 @@ def radio_path_twice(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
             if first != radio.name:
                 path = ("hardware", profile.name, "radios", radio.name, "path")
                 yield Finding(path, f"{first} has the same path", "a unique path", radio.path)
+
+
+@fleet_rule(
+    "MC351",
+    Severity.WARNING,
+    "The transmit power is nearly off",
+    why="""0 dBm is 1 mW, a thousandth of a usual beacon's power: the radio works, and nothing beyond the next room
+    hears it. In other firmware, 0 means the most that is allowed; here it does not.""",
+    fix="Set `tx_power_dbm` to what the link needs; without it, it is the hardware's. `mesh: null` turns a radio off.",
+    failing="defaults: {radios: {radio0: {tx_power_dbm: 0}}}",
+    passing="defaults: {radios: {radio0: {tx_power_dbm: 10}}}",
+)
+def power_nearly_off(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for node, radio, _ in _transmitting(fleet):
+        if radio.tx_power_dbm + radio.hardware.amplifier_gain_db < _LEAST_DBM:
+            path = _drive_path(fleet, node, radio)
+            yield Finding(path, "hardly anything hears it", f"{_LEAST_DBM} dBm or more", f"{radio.tx_power_dbm} dBm")
