@@ -30,6 +30,7 @@ from meshctl.placement.reading import is_due_to_speak, line, page, reading_json,
 from meshctl.robots.local_daemon import DaemonError, LocalDaemon, socket_path
 from meshctl.robots.position_facts import positions_in
 from meshctl.suggest import did_you_mean
+from meshctl.wording import join_limited
 
 DEFAULT_LOAD_MBIT_S = 2.0
 # Shorter ways between two positions are the noise of an odometry.
@@ -125,7 +126,8 @@ def _poller_of(fleet_view: FleetView, robot: str, stock: BeaconStock) -> LinkPol
         known = [*fleet.robots, *fleet.nodes]
         if robot in known:
             raise InputError(f"{robot} has no managed radio: the meter needs one that moves with it")
-        raise InputError(f"{fleet.name} has no robot {robot!r}", hint=did_you_mean(robot, known))
+        hint = did_you_mean(robot, known) or f"its robots are {join_limited(list(fleet.robots))}"
+        raise InputError(f"{fleet.name} has no robot {robot!r}", hint=hint)
     base = fleet.base_of(own[0])
     if base is None:
         raise InputError(f"{fleet.name} has no node with the role base: the meter needs to know where paths end")

@@ -145,5 +145,23 @@ def _parse_key(path: Path, passphrase: Secret | None) -> PKey:
         raise InputError(
             f"{path}: the key is encrypted and needs a passphrase, or is not encrypted and a passphrase was given"
         ) from error
-    except (paramiko.SSHException, UnknownKeyType, UnsupportedAlgorithm, ValueError, OSError) as error:
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read as a private key: {error.strerror or error}") from error
+    except (UnknownKeyType, UnsupportedAlgorithm) as error:
         raise InputError(f"{path}: cannot be used as a private key: {error}") from error
+    except (paramiko.SSHException, ValueError) as error:
+        if passphrase is not None:
+            raise InputError(f"{path}: the passphrase is wrong, or the file is damaged") from error
+        if _is_public_key(path):
+            hint = f"name the private key: {path.with_suffix('')}" if path.suffix == ".pub" else "name the private key"
+            raise InputError(f"{path}: is a public key, and a login needs the private one", hint=hint) from error
+        message = "is not a private key in OpenSSH or PEM format, or a damaged one"
+        raise InputError(f"{path}: {message}", hint="`ssh-keygen -t ed25519` makes one") from error
+
+
+def _is_public_key(path: Path) -> bool:
+    try:
+        first = path.read_bytes()[:64].split(b" ", 1)[0]
+    except OSError:
+        return False
+    return first.startswith((b"ssh-", b"ecdsa-sha2-", b"sk-"))

@@ -15,7 +15,7 @@ from meshctl.cli.context import AsJson, LabDirectory, lab_directory
 from meshctl.cli.output import echo, echo_json, terminal_width, write_file
 from meshctl.device.framing import command_line
 from meshctl.errors import InputError
-from meshctl.model import Backend, Fleet, Release
+from meshctl.model import Backend, Band, Fleet, Release
 from meshctl.report import text_table
 from meshctl.resources import shipped
 from meshctl.wording import counted
@@ -37,6 +37,9 @@ _START_S = 60.0
 # the same under emulation: packages are downloaded, and the kernel boots, at worst twice
 _REAL_BOOT_S = 10.0
 _REAL_START_S = 600.0
+
+# 5250 to 5730 MHz
+_RADAR_CHANNELS = range(52, 145)
 
 Where = Annotated[str, typer.Argument(help="A node (b03) or a link (b01-b02).")]
 
@@ -62,6 +65,8 @@ def up(
     copy = copy_inventory(inventory or chosen or shipped("inventory") / "lab", place)
     spec = spec_of(copy.fleet, links=copy.links, nodes=nodes, port=port)
     if real:
+        for line in radar_notes(copy.fleet):
+            echo(line)
         echo("starting a QEMU machine with the kernel's radios; the first start builds its image")
         fleet: VirtualFleet = QemuFleet(spec, place).up(wait_s=_REAL_START_S + _REAL_BOOT_S * len(spec.nodes))
     else:
@@ -79,6 +84,16 @@ def up(
     echo(f"console:   meshctl lab shell {fleet.spec.names[0]}")
     for line in next_steps(copy.fleet):
         echo(line)
+
+
+def radar_notes(fleet: Fleet) -> list[str]:
+    """A note for each mesh on a channel with radar detection, which a mesh of the kernel's virtual radios cannot do."""
+    meshes = [mesh for mesh in fleet.meshes.values() if mesh.band is Band.G5 and mesh.channel in _RADAR_CHANNELS]
+    return [
+        f"note:      mesh {mesh.name} will not form on channel {mesh.channel}: virtual radios detect no radar; "
+        "use 36 to 48, or 149 and above, in a copy of the inventory"
+        for mesh in meshes
+    ]
 
 
 def next_steps(fleet: Fleet) -> list[str]:

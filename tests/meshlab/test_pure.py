@@ -151,3 +151,11 @@ def test_nodes_that_the_lab_cannot_route_are_left_plugged_in(name: str, *, is_ro
     text = "\n".join(commands.next_steps(load_fleet(shipped("inventory") / name, environ={})))
     assert ("meshctl lab unplug" in text) == is_routed
     assert ("no node of mesh drift is reached" in text) != is_routed
+
+
+@pytest.mark.parametrize(("channel", "is_noted"), [(36, False), (100, True), (149, False)])
+def test_a_mesh_that_waits_for_radar_is_noted_for_the_real_lab(channel: int, is_noted: bool, tmp_path: Path) -> None:
+    text = (shipped("inventory") / "swarm" / "fleet.yaml").read_bytes().decode("utf-8")
+    (tmp_path / "fleet.yaml").write_text(text.replace("channel: 149", f"channel: {channel}"), encoding="utf-8")
+    notes = commands.radar_notes(load_fleet(tmp_path, environ={}))
+    assert [f"mesh air will not form on channel {channel}" in note for note in notes] == [True] * is_noted

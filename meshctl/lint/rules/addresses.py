@@ -133,12 +133,22 @@ def _outside(fleet: Fleet) -> dict[str, list[Node]]:
 
 
 def wrong_networks(fleet: Fleet) -> frozenset[str]:
-    """The meshes whose `network` is the mistake, because half of the nodes or more are outside. Addresses of rules with
-    `network` are in any."""
+    """The meshes whose `network` is the mistake, because half of their stations or more are outside; addresses of rules
+    with `network` are in any."""
+    outside = _outside(fleet)
+    if not outside:
+        return frozenset()
+    # computers are addressed like the radios that bridge them
+    inside = {name: [node.address.ip in fleet.meshes[name].network for node in fleet.members(name)] for name in outside}
+    for robot in fleet.robots.values():
+        for name in {mesh for node in robot.nodes if node in fleet.nodes for mesh in fleet.nodes[node].meshes[:1]}:
+            if name in inside and robot.lan is None:
+                computers = (computer for _, _, computer in robot.all_computers())
+                inside[name] += [computer.address.ip in fleet.meshes[name].network for computer in computers]
     return frozenset(
         name
-        for name, nodes in _outside(fleet).items()
-        if len(nodes) >= _WRONG_NETWORK_NODES and 2 * len(nodes) >= sum(1 for _ in fleet.members(name))
+        for name, nodes in outside.items()
+        if len(nodes) >= _WRONG_NETWORK_NODES and 2 * inside[name].count(False) >= len(inside[name])
     )
 
 

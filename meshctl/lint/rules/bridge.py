@@ -366,8 +366,8 @@ def filter_without_bridge(fleet: Fleet, _context: LintContext) -> Iterator[Findi
     why="""Frames without a tag that enter the port belong to one VLAN only, the port's own (PVID): what is connected
     there hears both VLANs and reaches one, or the WAN and the LAN are one network.""",
     fix="List the port in one of them, or tagged (`5t`) in one.",
-    failing="hardware: {rocket: {switch_vlans: {1: 2 3 0t, 2: 1 3 0t}}}",
-    passing="hardware: {rocket: {switch_vlans: {1: 2 3 0t, 2: 1 3t 0t}}}",
+    failing="hardware: {rocket: {lan_ports: [eth0.1], switch_vlans: {1: 2 3 0t, 2: 1 3 0t}}}",
+    passing="hardware: {rocket: {lan_ports: [eth0.1], switch_vlans: {1: 2 3 0t, 2: 1 3t 0t}}}",
 )
 def untagged_twice(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for profile in fleet.hardware.values():

@@ -12,7 +12,7 @@ from meshctl.diagnostics import Severity
 from meshctl.errors import InputError
 from meshctl.inventory.file_paths import known_hosts_path
 from meshctl.lint.context import LintContext
-from meshctl.lint.grouping import duplicates
+from meshctl.lint.grouping import duplicates, group_by_key
 from meshctl.lint.places import is_written
 from meshctl.lint.rule import Example, Finding, fleet_rule
 from meshctl.model import Fleet, Node, NodeState
@@ -70,10 +70,14 @@ def hostname_twice(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     passing="nodes: {b01: {hostname: beacon-1}}",
 )
 def hostname_invalid(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    for node in fleet.nodes.values():
-        if _LABEL.fullmatch(node.hostname) is None:
-            path = ("nodes", node.name, "hostname")
-            yield Finding(path, "invalid hostname", "letters, digits and inner hyphens, at most 63", node.hostname)
+    wrong = [node for node in fleet.nodes.values() if _LABEL.fullmatch(node.hostname) is None]
+    # a range makes many of them
+    at = group_by_key((fleet.where("nodes", node.name, "hostname").position, node) for node in wrong)
+    for nodes in at.values():
+        path = ("nodes", nodes[0].name, "hostname")
+        message = "invalid hostname" if len(nodes) == 1 else "invalid hostnames"
+        found = join_limited([node.hostname for node in nodes])
+        yield Finding(path, message, "letters, digits and inner hyphens, at most 63", found)
 
 
 @fleet_rule(

@@ -9,10 +9,10 @@ from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
 from meshctl.lint.grouping import group_by_key, overlaps
 from meshctl.lint.rule import Finding, fleet_rule
-from meshctl.lint.rules.addresses import meshes_of, networks, stations
+from meshctl.lint.rules.addresses import meshes_of, networks, stations, wrong_networks
 from meshctl.lint.rules.team import reached_from_base
 from meshctl.model import Backend, Fleet, Mesh, Role
-from meshctl.model.ip import IpAddress, IpNetwork
+from meshctl.model.ip import IpAddress, IpInterface, IpNetwork
 from meshctl.wording import join_limited
 
 # RFC 1918, RFC 6598 (carrier-grade NAT), and RFC 4193 (unique local IPv6)
@@ -26,6 +26,10 @@ _UNUSABLE = tuple(
     ip_network(text)
     for text in ("0.0.0.0/8", "127.0.0.0/8", "169.254.0.0/16", "224.0.0.0/3", "::/32", "fe80::/10", "ff00::/8")
 )
+
+
+# so many computers of a network, all with another prefix length: the network's is wrong
+_WRONG_PREFIXES = 3
 
 
 @fleet_rule(
@@ -132,20 +136,35 @@ def _unusable(network: IpNetwork) -> bool:
     passing="robots: {husky1: {computer: {address: 10.42.0.120/24}}}",
 )
 def prefix_differs(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    there: dict[tuple[str, str, IpNetwork], list[tuple[tuple[str, ...], str, IpInterface]]] = {}
     for robot in fleet.robots.values():
         around = [("the robot's LAN", "the LAN's", robot.lan)] if robot.lan is not None else []
         if not around:
             # meshes may share a network
             first_of = {mesh.network: mesh.name for mesh in reversed(tuple(fleet.meshes.values()))}
             around = [(f"mesh {name}", "the mesh's", network) for network, name in first_of.items()]
-        for place, _, computer in robot.all_computers():
-            address = computer.address
+        for place, name, computer in robot.all_computers():
             for where, whose, network in around:
-                if address.ip in network and address.network != network:
+                if computer.address.ip in network:
                     path = ("robots", robot.name, *place, "address")
-                    expected = f"/{network.prefixlen} as in {where}"
-                    found = f"/{address.network.prefixlen}"
-                    yield Finding(path, f"prefix length differs from {whose}", expected, found)
+                    there.setdefault((where, whose, network), []).append((path, name, computer.address))
+    for (where, whose, network), computers in there.items():
+        wrong = [one for one in computers if one[2].network != network]
+        lengths = {address.network.prefixlen for _, _, address in wrong}
+        name = where.removeprefix("mesh ")
+        if (
+            len(wrong) >= _WRONG_PREFIXES
+            and len(wrong) == len(computers)
+            and len(lengths) == 1
+            and name in fleet.meshes
+        ):
+            # one mistake in the network, rather than one in each address
+            message = f"its length differs from that of {join_limited([what for _, what, _ in wrong])}"
+            yield Finding(("meshes", name, "network"), message, f"/{lengths.pop()}", f"/{network.prefixlen}")
+            continue
+        for path, _, address in wrong:
+            expected = f"/{network.prefixlen} as in {where}"
+            yield Finding(path, f"prefix length differs from {whose}", expected, f"/{address.network.prefixlen}")
 
 
 @fleet_rule(
@@ -249,8 +268,8 @@ def base_in_other_network(fleet: Fleet, _context: LintContext) -> Iterator[Findi
             known += [computer.address.ip, *(link.address for link in computer.links if link.address is not None)]
     if not bases:
         return
-    # MC601 reports the other meshes
-    reached = reached_from_base(fleet)
+    # MC601 reports the other meshes, MC202 a wrong network
+    reached = reached_from_base(fleet) - wrong_networks(fleet)
     others = {
         mesh.name
         for mesh in fleet.meshes.values()

@@ -12,6 +12,8 @@ from meshctl.lint.rule import Finding, fleet_rule
 from meshctl.model import AntennaKind, Fleet, Mesh, Node, Radio
 from meshctl.regdb import CHANNELS, check_span, primary_span
 
+# below this, a radio reaches the next room; 0 is "automatic" in other firmware
+_LEAST_DBM = 4
 # 47 CFR 15.247(b)(3), (b)(4), and the same in RSS-247 5.4(d): digital modulation at 2400-2483.5 and 5725-5850 MHz
 _CONDUCTED_LIMIT_DBM = 30.0
 _FREE_GAIN_DBI = 6.0
@@ -25,8 +27,6 @@ _ASYMMETRY_DB = 10.0
 _CLASS_TOLERANCE_DB = 3.0
 # 40 dBm is 10 W, more than any robot radio; 500 or 1000 are milliwatts
 _MAX_RATED_DBM = 40.0
-# 5 dBm is 3 mW, less than any radio of a mesh is meant to transmit; 1 or 2 are watts
-_MIN_PLAUSIBLE_DBM = 5.0
 
 
 def _dbm(value: float) -> str:
@@ -305,20 +305,22 @@ def radio_path_twice(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
 @fleet_rule(
     "MC351",
     Severity.WARNING,
-    "A power looks like watts",
-    why="""Powers are in dBm: 1 W is 30, 2 W is 33. A radio at 2 dBm transmits less than 2 mW, and reaches a twentieth
-    of the distance.""",
-    fix="Write dBm: 10 * log10(mW). 2 W is 33 dBm.",
+    "A power is nearly nothing",
+    why="""Powers are in dBm: 1 W is 30, 2 W is 33, and 0 dBm is 1 mW. At 2 dBm, a radio works, and hardly anything
+    beyond the next room hears it. In other firmware, 0 means the most that is allowed; here it does not.""",
+    fix="""Write dBm: 10 * log10(mW). Without `tx_power_dbm`, the hardware's power is used; `mesh: null` turns a radio
+    off.""",
     failing="defaults: {radios: {radio0: {tx_power_dbm: 2}}}",
-    passing="defaults: {radios: {radio0: {tx_power_dbm: 24}}}",
+    passing="defaults: {radios: {radio0: {tx_power_dbm: 10}}}",
 )
-def power_in_watts(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+def power_nearly_nothing(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    expected = f"{_LEAST_DBM} dBm or more"
     for profile in fleet.hardware.values():
         for built_in in profile.radios:
-            if built_in.rated_power_dbm < _MIN_PLAUSIBLE_DBM:
+            if built_in.rated_power_dbm < _LEAST_DBM:
                 rating = ("hardware", profile.name, "radios", built_in.name, "rated_power_dbm")
-                yield Finding(rating, "not a plausible power in dBm", "at least 5", _dbm(built_in.rated_power_dbm))
+                yield Finding(rating, "2 W is 33 dBm", expected, f"{_dbm(built_in.rated_power_dbm)} dBm")
     for node, radio, _ in _transmitting(fleet):
-        if radio.tx_power_dbm < _MIN_PLAUSIBLE_DBM:
+        if radio.tx_power_dbm + radio.hardware.amplifier_gain_db < _LEAST_DBM:
             path = _drive_path(fleet, node, radio)
-            yield Finding(path, "not a plausible power in dBm", "at least 5", str(radio.tx_power_dbm))
+            yield Finding(path, "hardly anything hears it", expected, f"{radio.tx_power_dbm} dBm")

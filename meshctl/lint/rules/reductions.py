@@ -1,4 +1,4 @@
-"""Topics whose messages the ROS bridge reduces (MC721 to MC724)."""
+"""Topics whose messages the ROS bridge reduces (MC721 to MC729)."""
 
 from __future__ import annotations
 
@@ -122,3 +122,20 @@ def not_reduced(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
             found = join_limited([f"{name}: {ros}" for name, ros in lacking])
             expected = f"ros: {ROS_1} on their computers"
             yield Finding(_path(topic), "some sources have no deployed bridge", expected, found)
+
+
+@fleet_rule(
+    "MC729",
+    Severity.WARNING,
+    "A topic is reduced to more than is published",
+    why="""`reduce.rate_hz` is the most that the bridge sends. Above the topic's own `rate_hz` it reduces nothing.""",
+    fix="Set `reduce.rate_hz` below `rate_hz`, or correct `rate_hz`: it is what the robot's programs publish.",
+    failing=_HUSKY + _CAMERA + "rate_hz: 1, size_bytes: 2000, reduce: {rate_hz: 30}}}",
+    passing=_HUSKY + _CAMERA + "rate_hz: 30, size_bytes: 2000, reduce: {rate_hz: 1}}}",
+)
+def not_less(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for topic in fleet.topics:
+        rate_hz = topic.reduce.rate_hz if topic.reduce is not None else None
+        if rate_hz is not None and 0 < topic.rate_hz < rate_hz:
+            expected = f"less than {topic.rate_hz:g} Hz (rate_hz)"
+            yield Finding(_path(topic, "rate_hz"), "reduces nothing", expected, f"{rate_hz:g} Hz")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
@@ -36,6 +37,10 @@ def _unknown(fleet: Fleet, path: tuple[str, ...], names: Sequence[str]) -> Itera
             hint = 'patterns are for commands: list the nodes, or a range such as "b[01-03]"'
         message = "no such node" if len(wrong) == 1 else "no such nodes"
         yield Finding((*path, wrong[0]), message, "names of `nodes`", join_limited(wrong), hint)
+
+
+# so many robots with a radio that does not exist: the nodes are the mistake
+_MANY_ROBOTS = 3
 
 
 def unmeshed(fleet: Fleet, node: Node) -> str:
@@ -93,8 +98,18 @@ def unknown_robot(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     passing="robots: {husky1: {nodes: [husky1-front]}}",
 )
 def unknown_node_of_robot(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    for robot in fleet.robots.values():
-        yield from _unknown(fleet, ("robots", robot.name, "nodes"), robot.nodes)
+    found = [
+        finding
+        for robot in fleet.robots.values()
+        for finding in _unknown(fleet, ("robots", robot.name, "nodes"), robot.nodes)
+    ]
+    if len(found) > _MANY_ROBOTS:
+        # the range of the nodes has another name
+        names = [finding.found for finding in found]
+        robots = join_limited([finding.path[1] for finding in found[1:]])
+        yield replace(found[0], message=f"no such nodes (also of {robots})", found=join_limited(names))
+    else:
+        yield from found
 
 
 @fleet_rule(

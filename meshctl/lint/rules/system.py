@@ -117,6 +117,15 @@ def server_is_radio(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     radios: dict[IpAddress | None, Node] = {
         address.ip: node for node in fleet.managed() for address in (node.address, node.lan_address) if address
     }
+    addresses = {
+        **{robot.name: robot.computer.address.ip for robot in fleet.robots.values() if robot.computer is not None},
+        **{node.name: node.address.ip for node in fleet.managed()},
+    }
+    servers = [(("system", "ntp_servers", str(number)), host) for number, host in enumerate(fleet.system.ntp_servers)]
+    for path, host in ((("system", "log_host"), fleet.system.log_host), *servers):
+        if host in addresses:
+            message = "nodes do not resolve names of the inventory"
+            yield Finding(path, message, str(addresses[host]), host, "Write the address.")
     node = radios.get(as_address(fleet.system.log_host))
     if node is not None and not any(package in _LOG_SERVERS for package in (*node.hardware.packages, *node.packages)):
         message = f"{node.name} is a radio, which receives no logs"

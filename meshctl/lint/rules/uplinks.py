@@ -1,13 +1,13 @@
-"""Where the nodes' default routes lead (MC223)."""
+"""Where the nodes' default routes and batman-adv's clients lead (MC223 to MC224)."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
 from meshctl.lint.rule import Finding, fleet_rule
-from meshctl.lint.trial_rendering import has_own_templates
 from meshctl.model import Fleet, Node
 from meshctl.model.ip import IpAddress
 
@@ -27,7 +27,7 @@ from meshctl.model.ip import IpAddress
     """,
 )
 def gateway_without_uplink(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    if has_own_templates(fleet):
+    if _has_own_network(fleet):
         return
     radios: dict[IpAddress, Node] = {node.address.ip: node for node in fleet.nodes.values()}
     for node in fleet.managed():
@@ -44,8 +44,42 @@ def gateway_without_uplink(fleet: Fleet, _context: LintContext) -> Iterator[Find
         yield Finding(path, f"{router.name} has no uplink", "a router, or a radio with an uplink", str(node.gateway))
 
 
+def _has_own_network(fleet: Fleet) -> bool:
+    """Whether a template of the inventory writes /etc/config/network, with whatever interfaces."""
+    return any((Path(fleet.base) / "templates").glob("*/etc/config/*network*.j2"))
+
+
 def _has_uplink(fleet: Fleet, node: Node) -> bool:
     has_interface = any(key.startswith("network.") and value == "interface" for key, value in node.extra_uci.items())
     is_router = node.gateway is not None or node.lan_address is not None
     own_parts = any(fleet.meshes[name].operator_parts.templates for name in node.meshes if name in fleet.meshes)
     return has_interface or is_router or own_parts
+
+
+@fleet_rule(
+    "MC224",
+    Severity.WARNING,
+    "No node is a gateway for batman-adv's clients",
+    why="""With `gw_mode: client`, batman-adv sends DHCP requests to the best gateway that announces itself. Without one
+    they are flooded as before, and devices that expect an address from the internet gateway get none.""",
+    fix="Set `extra_uci: {network.bat0.gw_mode: server}` on the nodes with an uplink, or remove `gw_mode`.",
+    failing="meshes: {main: {batman: {gw_mode: client}}}",
+    passing="""
+    meshes: {main: {batman: {gw_mode: client}}}
+    nodes: {base: {extra_uci: {network.bat0.gw_mode: server}}}
+    """,
+)
+def clients_without_gateway(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    if _has_own_network(fleet):
+        return
+    serving = {
+        fleet.meshes[name].network
+        for node in fleet.managed()
+        if any(key.endswith(".gw_mode") and value == "server" for key, value in node.extra_uci.items())
+        for name in node.meshes
+        if name in fleet.meshes
+    }
+    for mesh in fleet.meshes.values():
+        if mesh.batman.gw_mode == "client" and mesh.network not in serving:
+            path = ("meshes", mesh.name, "batman", "gw_mode")
+            yield Finding(path, "no node of the mesh is a gateway", "a node with gw_mode server", "clients only")

@@ -55,3 +55,25 @@ def test_a_key_cached_with_its_passphrase_still_requires_it(tmp_path: Path, pars
     assert parsed == [path]
     with pytest.raises(InputError, match="needs a passphrase"):
         load_key(path, None)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "fault", "hint"),
+    [
+        ("key", "nonsense", "is not a private key in OpenSSH or PEM format", "ssh-keygen -t ed25519"),
+        ("key.pub", "ssh-ed25519 AAAA me@laptop", "is a public key", "name the private key: "),
+        ("key", "ssh-ed25519 AAAA me@laptop", "is a public key", "name the private key"),
+        ("key", None, "cannot be read as a private key: Is a directory", ""),
+    ],
+)
+def test_what_is_no_private_key_is_named(name: str, content: str | None, fault: str, hint: str, tmp_path: Path) -> None:
+    """The message was the library's: `Unable to load PEM file. See https://cryptography.io/... MalformedFraming`."""
+    path = tmp_path / name
+    if content is None:
+        path.mkdir()
+    else:
+        path.write_text(content, encoding="utf-8")
+    with pytest.raises(InputError, match=fault) as raised:
+        load_key(path, None)
+    assert hint in raised.value.hint
+    assert "cryptography" not in str(raised.value)

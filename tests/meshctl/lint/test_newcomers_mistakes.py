@@ -82,7 +82,7 @@ def test_a_wrong_network_is_one_finding(tmp_path: Path) -> None:
     meshes: {main: {network: 10.77.0.0/24}}
     nodes: {"c[1-2]": {hardware: rocket, address: {rule: network + 200 + index}}}
     """
-    found = [one for one in _found(fragment, tmp_path) if one.code in ("MC202", "MC209", "MC212", "MC213")]
+    found = [one for one in _found(fragment, tmp_path) if one.code in ("MC202", "MC209", "MC212", "MC213", "MC221")]
     assert [(one.code, one.path) for one in found] == [("MC202", "meshes.main.network")]
 
 
@@ -134,3 +134,33 @@ def test_a_radio_of_another_band_is_the_reason_for_no_mesh(tmp_path: Path) -> No
 def test_a_label_is_shown_as_written(tmp_path: Path) -> None:
     found = _found("nodes: {b01: {label: Box}, base: {label: BOX}}", tmp_path)
     assert [(one.path, one.found) for one in found if one.code == "MC116"] == [("nodes.b01.label", "Box")]
+
+
+_ROBOTS = "".join(
+    f"  r{number}: {{nodes: [r{number}-radio], computer: {{address: 10.42.0.{150 + number}/24, ssh: {{user: r}}}}}}\n"
+    for number in range(1, 6)
+)
+
+
+def test_radios_under_another_name_are_one_finding(tmp_path: Path) -> None:
+    nodes = 'nodes: {"r[1-5]_radio": {role: robot, hardware: rocket, address: {from: 10.42.0.201}}}\nrobots:\n'
+    found = _found(nodes + _ROBOTS, tmp_path)
+    (unknown,) = [one for one in found if one.code == "MC103"]
+    assert unknown.message == "no such nodes (also of r2, r3, r4, r5)"
+    (hostname,) = [one for one in found if one.code == "MC111"]
+    assert (hostname.path, hostname.message) == ("nodes.r1_radio.hostname", "invalid hostnames")
+
+
+def test_a_network_with_another_prefix_than_all_computers_is_one_finding(tmp_path: Path) -> None:
+    nodes = 'nodes: {"r[1-5]-radio": {role: robot, hardware: rocket, address: {from: 10.42.0.201}}}\nrobots:\n'
+    found = _found("meshes: {main: {network: 10.42.0.0/23}}\n" + nodes + _ROBOTS, tmp_path)
+    assert [(one.path, one.expected, one.found) for one in found if one.code == "MC210"] == [
+        ("meshes.main.network", "/24", "/23")
+    ]
+
+
+@pytest.mark.parametrize("key", ["log_host: base-station", "ntp_servers: [base-station]"])
+def test_a_name_of_the_inventory_is_no_host_name(key: str, tmp_path: Path) -> None:
+    fragment = f"system: {{{key}}}\nnodes: {{b01: {{gateway: 10.42.0.254}}}}"
+    (finding,) = [one for one in _found(fragment, tmp_path) if one.code == "MC235"]
+    assert (finding.expected, finding.found) == ("10.42.0.100", "base-station")
