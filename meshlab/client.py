@@ -16,6 +16,11 @@ from meshlab.errors import LabError
 from meshlab.kernel_log import CONSOLE, blocked_tasks
 from meshlab.node_runner import MESSAGE_BYTES
 
+ANSWER_S = 60.0
+"""What an answer of a fleet may take."""
+MACHINE_ANSWER_S = 300.0
+"""The same of a fleet in an emulated machine, which is many times slower than its host."""
+
 
 @contextmanager
 def _connected(directory: Path, timeout_s: float | None = None) -> Iterator[socket.socket]:
@@ -31,7 +36,7 @@ def _connected(directory: Path, timeout_s: float | None = None) -> Iterator[sock
 
 
 def request(
-    directory: Path, message: dict[str, Any], descriptors: Sequence[int] = (), *, timeout_s: float | None = 60.0
+    directory: Path, message: dict[str, Any], descriptors: Sequence[int] = (), *, timeout_s: float | None = ANSWER_S
 ) -> dict[str, Any]:
     """Send one request and return the reply.
 

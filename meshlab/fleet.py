@@ -26,7 +26,7 @@ from meshctl.errors import InputError
 from meshctl.wording import counted
 from meshlab import fleet_directory, propagation_file, rootfs
 from meshlab.addresses import bench_of, loopback_of
-from meshlab.client import is_running, request
+from meshlab.client import ANSWER_S, MACHINE_ANSWER_S, is_running, request
 from meshlab.errors import LabError
 from meshlab.qemu.qemu import find_qemu
 from meshlab.spec import FleetSpec, Medium, dump, load
@@ -82,16 +82,17 @@ class VirtualNode:
         """Its LAN port on the bench; answers while the node is plugged in and has the address 192.168.1.1."""
         return Endpoint(bench_of(self._state()["number"]), self._fleet.port, identity=self.name)
 
-    def exec(self, command: str, *, stdin: bytes = b"", timeout_s: float = 60.0) -> Completed:
+    def exec(self, command: str, *, stdin: bytes = b"", timeout_s: float | None = None) -> Completed:
         """Run a shell command on its serial console, which needs neither network nor SSH.
 
-        Raises LabError when the node is off, the fleet has ended or `timeout_s` passes.
+        Raises LabError when the node is off, the fleet has ended or `timeout_s` passes; without it, `ANSWER_S` counts.
         """
         with tempfile.TemporaryFile() as source, tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
             source.write(stdin)
             source.seek(0)
             descriptors = (source.fileno(), out.fileno(), err.fileno())
-            answer = self._fleet.request_with_fds(descriptors, timeout_s, "exec", node=self.name, command=command)
+            limit_s = self._fleet.ANSWER_S if timeout_s is None else timeout_s
+            answer = self._fleet.request_with_fds(descriptors, limit_s, "exec", node=self.name, command=command)
             if answer["reason"]:
                 raise LabError(f"{self.name}: {answer['reason']}")
             out.seek(0)
@@ -169,6 +170,7 @@ class VirtualFleet:
 
     # the module that runs as the fleet's process
     SUPERVISOR = "meshlab.supervisor"
+    ANSWER_S = ANSWER_S
 
     def __init__(self, spec: FleetSpec, directory: Path) -> None:
         self.spec = spec
@@ -310,12 +312,12 @@ class VirtualFleet:
 
     def request(self, operation: str, **arguments: Any) -> dict[str, Any]:
         """One request to the supervisor (`control.Operations`)."""
-        return request(self.directory, {"op": operation, **arguments})
+        return request(self.directory, {"op": operation, **arguments}, timeout_s=self.ANSWER_S)
 
     def request_with_fds(
         self, descriptors: tuple[int, ...], timeout_s: float | None, operation: str, **arguments: Any
     ) -> dict[str, Any]:
-        """A request that passes descriptors for a process on a node."""
+        """A request that passes descriptors for a process on a node; without `timeout_s` it waits for ever."""
         return request(self.directory, {"op": operation, **arguments}, descriptors, timeout_s=timeout_s)
 
     def __enter__(self) -> Self:
@@ -334,6 +336,7 @@ class QemuFleet(VirtualFleet):
     """
 
     SUPERVISOR = "meshlab.qemu.host_proxy"
+    ANSWER_S = MACHINE_ANSWER_S
 
     def _check_programs(self) -> None:
         find_qemu()

@@ -8,7 +8,17 @@ from itertools import pairwise
 from meshctl.model import Fleet, Node, Robot, Role
 from meshctl.resolve import computer_gateway, lan_filter_needs
 from meshlab.errors import LabError
-from meshlab.spec import DEFAULT_DRIVER, MESH_PACKAGES, FleetSpec, LanSpec, LinkSpec, Medium, NodeSpec, RadioSpec
+from meshlab.spec import (
+    DEFAULT_DRIVER,
+    MESH_PACKAGES,
+    SSH_PORT,
+    FleetSpec,
+    LanSpec,
+    LinkSpec,
+    Medium,
+    NodeSpec,
+    RadioSpec,
+)
 
 # the default topology is a chain up to this size, a tree above
 _MAX_CHAIN_NODES = 12
@@ -98,4 +108,6 @@ def _node_spec(node: Node, number: int) -> NodeSpec:
         medium=Medium.BASE if node.role is Role.BASE else Medium.BENCH,
         overlay_kib=max(1024, hardware.flash_mib * 1024 // 2),
         memory_kib=hardware.memory_mib * 1024,
+        # behind another host, `port` is that of the host
+        ssh_port=SSH_PORT if node.ssh.host else node.ssh.port,
     )

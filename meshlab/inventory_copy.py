@@ -2,13 +2,14 @@
 
 The user's inventory is not changed. `copy_inventory` claims DIRECTORY for the lab, copies the inventory's files into
 `DIRECTORY/inventory`, generates a key pair in `DIRECTORY/keys`, and writes the public key and the key file's path into
-the copy. The copy has its own known_hosts: the original's is neither copied nor written.
+the copy. The copy has its own known_hosts: the original's is neither copied nor written. Robots' computers that the
+original reaches by an `ssh.host` have none in the copy: `meshctl robots` would deploy to the real robots.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,7 +17,8 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from cryptography.hazmat.primitives.asymmetric.rsa import generate_private_key
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, PublicFormat
 
-from meshctl.fleet.lab_directory import INVENTORY, KEY_COMMENT
+from meshctl.fleet.lab_directory import INVENTORY, KEY_COMMENT, lab_of
+from meshctl.fleet.lab_sites import is_this_machine
 from meshctl.inventory import load_fleet
 from meshctl.inventory.edit import Editor, save
 from meshctl.model import Fleet, Release
@@ -37,7 +39,8 @@ _RSA_BITS, _RSA_EXPONENT = 3072, 65537
 class InventoryCopy:
     """The copied inventory's path, its fleet, its login key, and the content of the links file (None: no file).
 
-    `kept` is the new path of an earlier copy with edits, None when there was none.
+    `kept` is the new path of an earlier copy with edits, None when there was none. `hosts` are the values of
+    `ssh.host` that are not in the copy.
     """
 
     inventory: Path
@@ -45,6 +48,7 @@ class InventoryCopy:
     key_file: Path
     links: list[LinkSpec] | None
     kept: Path | None = None
+    hosts: tuple[str, ...] = ()
 
 
 def copy_inventory(source: Path, directory: Path, *, environ: Mapping[str, str] = os.environ) -> InventoryCopy:
@@ -72,11 +76,22 @@ def copy_inventory(source: Path, directory: Path, *, environ: Mapping[str, str] 
         place = ("operators", "known_hosts")
         is_beside = Path(fleet.where(*place).position.file).parent == folder
         editor.set(place, _KNOWN_HOSTS if is_beside else str(target / _KNOWN_HOSTS))
+    # a lab's own copy has those of test machines, which the user has set there
+    hosts = () if lab_of(str(source.resolve())) else tuple(_without_hosts(editor, fleet))
     save(editor.changes())
     fleet_directory.record_digests(directory)
     links = target / LINKS_FILE
     link_specs = list(links_of(propagation_file.load(links))) if links.exists() else None
-    return InventoryCopy(copied, load_fleet(copied, environ=environ), key_file, link_specs, kept)
+    return InventoryCopy(copied, load_fleet(copied, environ=environ), key_file, link_specs, kept, hosts)
+
+
+def _without_hosts(editor: Editor, fleet: Fleet) -> Iterator[str]:
+    """Remove the `ssh.host` of robots' computers on other machines; yields each."""
+    for robot in fleet.robots.values():
+        for place, _, computer in robot.all_computers():
+            if computer.ssh.host and not is_this_machine(computer.ssh.host):
+                editor.set(("robots", robot.name, *place, "ssh", "host"), "")
+                yield computer.ssh.host
 
 
 def _key_pair(path: Path, *, needs_rsa: bool) -> str:

@@ -21,7 +21,6 @@ from meshlab.shaped_tunnel import Shape, Tunnel, reset
 from meshlab.spec import Medium
 
 log = logging.getLogger("meshlab.port_forwarder")
-_SSH_PORT = 22
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,28 +81,15 @@ class PortForwarder:
         self._listeners.update(set(self.reachable().values()), self.port)
 
     async def _serve(self, port: ForwardedPort, client: socket.socket) -> None:
-        loop = asyncio.get_running_loop()
         state = self._fleet.nodes[port.node]
         boots = state.boots
         if state.hung:
             await self._hang(client)
             return
-        answer, descriptors = await self._control.request({"do": "dial", "node": port.node})
-        if not descriptors:
-            log.info("dial-failed node=%s reason=%s", port.node, answer.get("error"))
+        node = await self._dial(port)
+        if node is None:
             reset(client)
             client.close()
-            return
-        node = socket.socket(fileno=descriptors[0])
-        node.setblocking(False)
-        node.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        try:
-            await loop.sock_connect(node, (port.address, _SSH_PORT))
-        except OSError as error:
-            log.info("refused node=%s reason=%s", port.node, errno.errorcode.get(error.errno or 0))
-            reset(client)
-            client.close()
-            node.close()
             return
         path_shape = self._link_state.bench_shape if port.bench else self._link_state.path_shape
 
@@ -111,6 +97,25 @@ class PortForwarder:
             return None if state.hung else path_shape(port.node, port.address)
 
         await Tunnel(client, node, shape, self._link_state.condition, lambda: state.boots == boots, self._rng).run()
+
+    async def _dial(self, port: ForwardedPort) -> socket.socket | None:
+        """A connection to the node's SSH server; None if it does not accept one."""
+        for number in self._fleet.nodes[port.node].spec.ssh_ports:
+            answer, descriptors = await self._control.request({"do": "dial", "node": port.node})
+            if not descriptors:
+                log.info("dial-failed node=%s reason=%s", port.node, answer.get("error"))
+                return None
+            node = socket.socket(fileno=descriptors[0])
+            node.setblocking(False)
+            node.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            try:
+                await asyncio.get_running_loop().sock_connect(node, (port.address, number))
+            except OSError as error:
+                log.info("refused node=%s port=%s reason=%s", port.node, number, errno.errorcode.get(error.errno or 0))
+                node.close()
+            else:
+                return node
+        return None
 
     async def _hang(self, client: socket.socket) -> None:
         """Keep the connection open and send nothing until the client closes it."""

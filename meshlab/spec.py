@@ -33,6 +33,9 @@ class Medium(Enum):
 # it supports both modes of a mesh
 DEFAULT_DRIVER = "ath9k"
 
+# of a factory-fresh device
+SSH_PORT = 22
+
 
 @dataclass(frozen=True, slots=True)
 class RadioSpec:
@@ -56,7 +59,8 @@ class NodeSpec:
     `overlay_kib` is the flash left for changes, `memory_kib` the RAM. `host_key_types` None: the release's defaults
     (19.07 RSA, later RSA and ed25519); `("ed25519",)` makes big fleets start faster. `flash_s` is the time to write an
     image, `first_boot_s` the time from the first login to the last init script at the boot after that. `slowness` is
-    how many times longer than on a fast machine reloads of services and radios, and writing to flash, take.
+    how many times longer than on a fast machine reloads of services and radios, and writing to flash, take. `ssh_port`
+    is where the inventory has its SSH server, which is reached there and, as the factory has it, at 22.
     """
 
     name: str
@@ -75,6 +79,12 @@ class NodeSpec:
     flash_s: float = 1.0
     first_boot_s: float = 1.0
     slowness: int = 1
+    ssh_port: int = SSH_PORT
+
+    @property
+    def ssh_ports(self) -> tuple[int, ...]:
+        """The ports of its SSH server that are forwarded, in the order in which they are tried."""
+        return tuple(dict.fromkeys((self.ssh_port, SSH_PORT)))
 
 
 @dataclass(frozen=True, slots=True)

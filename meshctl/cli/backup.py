@@ -42,7 +42,7 @@ from meshctl.cli.context import (
     selected_nodes,
     session,
 )
-from meshctl.cli.journaled_run import JournaledRun, journaled_run, print_totals, retry_command, run_context
+from meshctl.cli.journaled_run import JournaledRun, journaled_run, print_totals, retry_hint, run_context
 from meshctl.cli.output import echo, echo_json
 from meshctl.cli.plan import Yes
 from meshctl.cli.plan_execution import PlanRefused
@@ -151,7 +151,7 @@ def restore(
             taken = time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(saved.taken_s))
             confirm(f"Restore {there.name} to its state of {taken}?")
         journaled = _restore(opened, there.name, saved, as_json=as_json)
-        raise print_totals(opened, journaled, as_json=as_json, retry=retry_command("restore"))
+        raise print_totals(opened, journaled, as_json=as_json, retry=retry_hint("restore"))
 
 
 def _show_restore(opened: Session, node: Node, saved: Backup, *, as_json: bool) -> None:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json
 import os
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import datetime
-from itertools import islice
+from itertools import islice, zip_longest
 from typing import Annotated, Any
 
 import typer
@@ -15,13 +16,14 @@ import typer
 from meshctl.cli.context import AsJson, line_width
 from meshctl.cli.history_follow import concerns, is_pattern
 from meshctl.cli.history_follow import follow as follow_runs
-from meshctl.cli.output import echo, echo_error, echo_json
+from meshctl.cli.output import echo, echo_error, echo_json, terminal_width
 from meshctl.cli.run_record import run_number
 from meshctl.errors import InputError
 from meshctl.fleet.journal import Journal, RunRecord
 from meshctl.fleet.journal_store import open_journal
 from meshctl.fleet.run_files import CHANGES, RunFiles
 from meshctl.plan.values import FileChange
+from meshctl.report import text_table
 from meshctl.report.changed_options import diff_lines, summary
 from meshctl.report.line_wrap import wrap
 from meshctl.report.terminal_escapes import clean
@@ -132,13 +134,17 @@ def _list_group(journal: Journal, records: list[RunRecord], node: str | None) ->
         )
         for listed_record in records
     ]
-    widths = [max(len(row[column]) for row in rows) for column in range(5)]
-    for row, record in zip(rows, [None, *records], strict=True):
-        cells = [cell.ljust(width) for cell, width in zip(row[1:5], widths[1:], strict=True)]
-        echo("  ".join([row[0].rjust(widths[0]), *cells, row[5]]).rstrip())
+    room = max(len(row[0]) for row in rows)
+    heading, *cells = ((row[0].rjust(room), *row[1:]) for row in rows)
+    leave_out = ("BY", "FLEET", "COMMAND")
+    width = terminal_width(sys.stdout)
+    lines = text_table.lines(heading, cells, width, leave_out=leave_out)
+    for line, record in zip_longest(lines, (None, *records)):
+        echo(line)
         for outcome in journal.outcomes(record.id) if record is not None and node is not None else ():
             if concerns(node, outcome.node):
-                echo(f"{'':{widths[0]}}  {outcome}")
+                for part in wrap(f"{'':{room}}  {outcome}", width):
+                    echo(part)
 
 
 def _fleet_text(fleet: str, lab: str) -> str:

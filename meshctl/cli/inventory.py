@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -14,7 +15,7 @@ from meshctl.cli.command_group import ImportGroup
 from meshctl.cli.context import AsJson, InventoryPath, Limit, Nodes, selected_node, selected_nodes
 from meshctl.cli.export import export
 from meshctl.cli.inventory_import import app as import_app
-from meshctl.cli.output import echo, echo_json, write_file
+from meshctl.cli.output import echo, echo_json, terminal_width, write_file
 from meshctl.cli.public_key import own_public_key
 from meshctl.inventory.edit import Editor, save, set_state
 from meshctl.inventory.explain import ExplainedValue, explain
@@ -22,6 +23,12 @@ from meshctl.inventory.json_schema import json_schema
 from meshctl.inventory.load import load_fleet
 from meshctl.inventory.starter import write_starter
 from meshctl.model import Node, NodeState, Role
+from meshctl.report import text_table
+from meshctl.report.line_wrap import wrap
+
+_GAP = "  "
+# the columns of `list` that a narrow terminal leaves out, in this order; those without any value first
+_LEAVE_OUT = ("LABEL", "RELEASE", "HARDWARE", "MESHES", "ROBOT", "ADDRESS")
 
 app = typer.Typer(help="Show and edit the inventory.", no_args_is_help=True)
 app.command("export")(export)
@@ -86,7 +93,9 @@ def list_nodes(
         echo_json(json.dumps({"fleet": fleet.name, "nodes": rows}, indent=2))
         return
     head = ("NODE", "ROLE", "STATE", "ADDRESS", "HARDWARE", "RELEASE", "MESHES", "ROBOT", "LABEL")
-    _table([head, *([_cell(value) for value in row.values()] for row in rows)])
+    cells = [[_cell(value) for value in row.values()] for row in rows]
+    for line in text_table.lines(head, cells, terminal_width(sys.stdout), leave_out=_LEAVE_OUT):
+        echo(line)
 
 
 @app.command("show")
@@ -108,7 +117,8 @@ def show(
         return
     written = [value for value in values if value.value or value.origin.layer != "built-in"]
     echo(name)
-    _table([_row(value, why) for value in written], indent="  ")
+    for line in _value_lines([_row(value, why) for value in written], terminal_width(sys.stdout)):
+        echo(line)
 
 
 @app.command("state")
@@ -171,9 +181,16 @@ def _row(value: ExplainedValue, why: bool) -> list[str]:
     return [value.key, text, value.origin.layer, f"{place.file}:{place.line}"]
 
 
-def _table(rows: Sequence[Sequence[str]], indent: str = "") -> None:
-    """Print rows with aligned columns."""
+def _value_lines(rows: Sequence[Sequence[str]], width: int | None) -> list[str]:
+    """Rows with aligned columns; if they do not fit into `width`, what follows a value is below it."""
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+    cells = ([cell.ljust(room) for cell, room in zip(row, widths, strict=True)] for row in rows)
+    lines = [f"  {_GAP.join(line)}".rstrip() for line in cells]
+    if width is None or max(map(len, lines)) <= width:
+        return lines
+    folded = []
     for row in rows:
-        cells = [cell.ljust(width) for cell, width in zip(row, widths, strict=True)]
-        echo((indent + "  ".join(cells)).rstrip())
+        key, value, *places = (row[0].ljust(widths[0]), *row[1:])
+        folded += wrap(f"  {key}{_GAP}{value}", width)
+        folded += wrap(f"    {_GAP.join(places)}", width) if places else []
+    return folded

@@ -137,17 +137,17 @@ def run_context(
 _WITH_ARGUMENTS = ("restore", "replace")
 
 
-def retry_command(command: str, undoes: int | None = None) -> str:
-    """The command that takes up what a run of `command` left; `undoes` is the run that a rollback takes back."""
+def retry_hint(command: str, undoes: int | None = None) -> str:
+    """The way to finish a run of `command`; `undoes` is the run that a rollback takes back."""
     if undoes is not None:
-        return f"meshctl rollback {undoes}"
-    return f"meshctl {command}" if command in _WITH_ARGUMENTS else "meshctl resume"
+        return f"run `meshctl rollback {undoes}`"
+    return f"repeat the same `meshctl {command}`" if command in _WITH_ARGUMENTS else "run `meshctl resume`"
 
 
 def print_totals(
-    opened: Session, run: JournaledRun, *, as_json: bool, unfinished: str = "nodes", retry: str = "meshctl resume"
+    opened: Session, run: JournaledRun, *, as_json: bool, unfinished: str = "nodes", retry: str = "run `meshctl resume`"
 ) -> typer.Exit:
-    """Print the totals, with `as_json` as the event `ended`, and the command `retry` if something is left; returns the
+    """Print the totals, with `as_json` as the event `ended`, and the hint `retry` if something is left; returns the
     exit to raise."""
     counted = totals(run.outcomes.values())
     # a closed pipe or terminal must not change the exit code
@@ -160,7 +160,5 @@ def print_totals(
         else:
             echo(f"run {run.entry.id}: {counted}")
             if not counted.all_good:
-                again = retry in (f"meshctl {command}" for command in _WITH_ARGUMENTS)
-                what = f"repeat the same `{retry}`" if again else f"run `{retry}`"
-                echo(f"{what} for the unfinished {unfinished}", err=True)
+                echo(f"{retry} for the unfinished {unfinished}", err=True)
     return typer.Exit(exit_for(run.outcomes.values(), opened.interrupt))

@@ -6,7 +6,7 @@ import sys
 
 import typer
 
-from meshctl.cli.output import echo
+from meshctl.cli.output import echo_lines
 from meshctl.device.trust import HostKey, TrustStore
 
 
@@ -29,7 +29,7 @@ def pin_host_key(
 
     def show(text: str) -> None:
         if not quiet:
-            echo(text)
+            echo_lines(text)
 
     pinned = trust.pinned(pin_name)
     line = f"{label}: {key.fingerprint} ({key.key_type})"
@@ -57,6 +57,6 @@ def _confirms(device: str, *, quiet: bool) -> bool:
     if quiet:
         return False
     if not sys.stdin.isatty():
-        echo(f"  hint: not a terminal: compare the fingerprint with that of the {device}, then pass --yes")
+        echo_lines(f"  hint: not a terminal: compare the fingerprint with that of the {device}, then pass --yes")
         return False
     return typer.confirm(f"  Does this match the fingerprint on the {device}?")

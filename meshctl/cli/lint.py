@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from enum import StrEnum
@@ -11,7 +12,7 @@ from typing import Annotated
 
 import typer
 
-from meshctl.cli.output import echo, echo_json, write_file
+from meshctl.cli.output import echo, echo_json, terminal_width, write_file
 from meshctl.diagnostics import Severity, sorted_diagnostics
 from meshctl.errors import ExitCode, InputError
 from meshctl.inventory.codes import MEANINGS
@@ -102,7 +103,8 @@ def lint(
         return
     if baseline is not None:
         findings = _without_known(findings, baseline, rules)
-    report = formatted(findings, "json" if json else format.value)
+    width = None if output is not None else terminal_width(sys.stdout)
+    report = formatted(findings, "json" if json else format.value, width)
     if output is not None:
         write_file(output, report)
         echo(f"{summary(findings)}: written to {output}", err=True)

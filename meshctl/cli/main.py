@@ -26,7 +26,7 @@ from meshctl import __version__
 from meshctl.cli.command_group import Command, CommandGroup
 from meshctl.cli.commands import COMMANDS, Entry
 from meshctl.cli.extensions import load
-from meshctl.cli.output import discard_output, echo, ignore_broken_pipe, outlive_reader, prepare_streams
+from meshctl.cli.output import discard_output, echo, echo_lines, ignore_broken_pipe, outlive_reader, prepare_streams
 from meshctl.errors import ExitCode, InputError, MeshctlError
 from meshctl.start_up import raise_at_ctrl_c
 
@@ -177,9 +177,9 @@ def _register(app: typer.Typer, name: str, entry: Entry) -> None:
 
 
 def _print_error(error: MeshctlError) -> None:
-    echo(f"error: {error}", err=True)
+    echo_lines(f"error: {error}", err=True)
     if error.hint:
-        echo(f"hint: {error.hint}", err=True)
+        echo_lines(f"hint: {error.hint}", err=True)
 
 
 def _prepare_group(group: typer.Typer) -> None:

@@ -20,6 +20,8 @@ from meshctl.errors import InputError
 from meshctl.report.terminal_escapes import clean, clean_styled, json_safe, one_line
 
 if TYPE_CHECKING:
+    from typing import TextIO
+
     from rich.console import Console
 
 
@@ -34,8 +36,30 @@ def echo_json(text: str, *, err: bool = False, nl: bool = True) -> None:
 
 
 def echo_error(text: str) -> None:
-    """Print text on standard error."""
-    echo(text, err=True)
+    """Print text on standard error, wrapped if it is a terminal."""
+    echo_lines(text, err=True)
+
+
+def echo_lines(text: str, *, err: bool = False) -> None:
+    """Print text, wrapped between words if the stream is a terminal."""
+    width = terminal_width(sys.stderr if err else sys.stdout)
+    if width is not None:
+        # imported only where it is needed: this module is part of every start
+        from meshctl.report.line_wrap import wrap
+
+        text = "\n".join(part for line in clean(text).split("\n") for part in wrap(line, width))
+    echo(text, err=err)
+
+
+def terminal_width(stream: TextIO) -> int | None:
+    """The width of the terminal that the stream writes to, or COLUMNS there; None for a pipe or a file."""
+    if not stream.isatty():
+        return None
+    given = os.environ.get("COLUMNS", "")
+    try:
+        return int(given) if given.isdecimal() and int(given) else os.get_terminal_size(stream.fileno()).columns or None
+    except OSError:
+        return None
 
 
 def echo_bytes(raw: bytes, *, err: bool = False) -> None:
@@ -119,8 +143,11 @@ def has_transient_line() -> bool:
 
 
 def transient_line(text: str) -> None:
-    """Replace the current line of the terminal, cut to its width; an empty text erases it."""
-    shown = one_line(text)[: shutil.get_terminal_size().columns - 1]
+    """Replace the current line of the terminal, shortened to its width; an empty text erases it."""
+    shown, room = one_line(text), shutil.get_terminal_size().columns - 1
+    if len(shown) > room:
+        # whole words: half a name is another node's
+        shown = shown[: room - 3].rpartition(" ")[0] + " ..."
     # the terminal may be closed
     with suppress(OSError):
         sys.stderr.write(f"\r\x1b[K{shown}")

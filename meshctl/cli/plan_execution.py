@@ -14,7 +14,7 @@ from meshctl.apply.executor import assign_slots, execute, unflushed_since
 from meshctl.apply.prepare import PlanOptions, Prepared, prepare
 from meshctl.apply.station_flush import StationFlushes
 from meshctl.cli.context import Session, confirm, line_width, selected_nodes
-from meshctl.cli.journaled_run import JournaledRun, journaled_run, print_totals, retry_command, run_context
+from meshctl.cli.journaled_run import JournaledRun, journaled_run, print_totals, retry_hint, run_context
 from meshctl.cli.output import console, echo_json
 from meshctl.cli.query_line import query_line
 from meshctl.cli.site_files import replaced_by, runs_at_site
@@ -226,7 +226,7 @@ def execute_plan(
         save_before(opened, run, changing, replaced_by(prepared))
         run.outcomes.update(execute_direct(opened, run, prepared, rate=rate))
         on_outcomes(run.outcomes)
-    raise print_totals(opened, run, as_json=as_json, retry=retry_command(command, undoes))
+    raise print_totals(opened, run, as_json=as_json, retry=retry_hint(command, undoes))
 
 
 def execute_direct(opened: Session, run: JournaledRun, prepared: Prepared, *, rate: float | None) -> dict[str, Outcome]:

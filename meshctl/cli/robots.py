@@ -14,7 +14,7 @@ import typer
 
 from meshctl.cli.context import DryRun, exit_for, line_width
 from meshctl.cli.key_pinning import pin_host_key
-from meshctl.cli.output import echo, echo_json
+from meshctl.cli.output import echo, echo_json, echo_lines
 from meshctl.cli.robots_context import SERVICE_TIMEOUT_S, RobotsContext, finish, run_command, with_robots_context
 from meshctl.cli.robots_dry_run import (
     command_differences,
@@ -133,7 +133,7 @@ def logs_command(
         for line in outcome.facts.get("log", "").splitlines():
             echo(f"{name}: {line}")
         if not outcome.result.is_good:
-            echo(str(outcome), err=True)
+            echo_lines(str(outcome), err=True)
     raise typer.Exit(exit_for(outcomes.values(), context.opened.interrupt))
 
 
@@ -186,7 +186,7 @@ def _pin_key(context: RobotsContext, robot: str, *, change: bool, yes: bool, dry
     try:
         shown = context.connector.presented_key(robot)
     except NodeError as error:
-        echo(f"{robot}: {error}" + (f"\n  hint: {error.hint}" if error.hint else ""))
+        echo_lines(f"{robot}: {error}" + (f"\n  hint: {error.hint}" if error.hint else ""))
         return False
     assert shown is not None, "a completed handshake presents a key"
     name = context.connector.endpoint(robot).identity

@@ -267,8 +267,8 @@ def _cache() -> Path:
     return root / "meshctl" / "wheels"
 
 
-def finish(context: RobotsContext, journaled: JournaledRun, retry: str = "meshctl resume") -> typer.Exit:
-    """Print the totals, and the command `retry` if something is left; returns the exit to raise."""
+def finish(context: RobotsContext, journaled: JournaledRun, retry: str = "run `meshctl resume`") -> typer.Exit:
+    """Print the totals, and the hint `retry` if something is left; returns the exit to raise."""
     return print_totals(context.opened, journaled, as_json=context.as_json, unfinished="robots", retry=retry)
 
 

@@ -13,7 +13,7 @@ from collections.abc import Callable
 import typer
 
 from meshctl.cli.context import exit_for
-from meshctl.cli.output import echo, echo_json
+from meshctl.cli.output import echo_json, echo_lines
 from meshctl.cli.robots_context import RobotsContext, RobotTask
 from meshctl.errors import ExitCode
 from meshctl.fleet import Outcome, Result
@@ -39,7 +39,7 @@ def print_differences(context: RobotsContext, work: RobotTask) -> dict[str, Outc
     else:
         for name, outcome in outcomes.items():
             for line in (outcome.reason or "no changes").splitlines():
-                echo(f"{name}: {line}")
+                echo_lines(f"{name}: {line}")
     return outcomes
 
 

@@ -151,7 +151,7 @@ def rotate_key_command(
             echo(f"stopped before the next step: {late} did not complete this one; no robot is cut off", err=True)
             echo("hint: run the same command again once they are reachable", err=True)
         if late or number == len(todo):
-            raise finish(context, journaled, retry=f"meshctl robots rotate-key {new_key}")
+            raise finish(context, journaled, retry=f"run `meshctl robots rotate-key {new_key}`")
 
 
 def _rotation_differences(context: RobotsContext, todo: tuple[RotationStage, ...]) -> typer.Exit:

@@ -22,7 +22,7 @@ from meshctl.apply.executor import unchanged_outcome
 from meshctl.apply.prepare import PlanOptions, Prepared
 from meshctl.apply.rollback import EarlierStates
 from meshctl.cli.context import Session, confirm, progress_for, selected_nodes
-from meshctl.cli.journaled_run import JournaledRun, journaled_run, print_totals, retry_command
+from meshctl.cli.journaled_run import JournaledRun, journaled_run, print_totals, retry_hint
 from meshctl.cli.output import echo, echo_error, echo_json
 from meshctl.cli.plan_execution import (
     PlanRefused,
@@ -300,7 +300,7 @@ def execute_everywhere(opened: Session, plan: WholePlan, options: RunOptions) ->
             if plan.direct is not None:
                 run.outcomes.update(execute_direct(opened, run, plan.direct, rate=options.rate_kb_s))
             run.outcomes.update(at_sites.result())
-    retry = retry_command(options.command, options.undoes)
+    retry = retry_hint(options.command, options.undoes)
     return print_totals(opened, run, as_json=options.as_json, retry=retry)
 
 

@@ -29,7 +29,7 @@ from meshctl.cli.context import (
     session,
 )
 from meshctl.cli.key_pinning import pin_host_key
-from meshctl.cli.output import echo, echo_bytes, echo_error, echo_json
+from meshctl.cli.output import echo, echo_bytes, echo_error, echo_json, echo_lines
 from meshctl.device.framing import command_line
 from meshctl.errors import ExitCode, InputError
 from meshctl.fleet import Outcome, Result
@@ -87,7 +87,7 @@ def _pin_key(opened: Session, item: HostKeyState, *, may_replace: bool, yes: boo
     name = item.node.name
     if item.key is None:
         if not quiet:
-            echo(f"{name}: {item.error}")
+            echo_lines(f"{name}: {item.error}")
         return False
     return pin_host_key(
         opened.trust,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from enum import Enum
 from pathlib import Path
@@ -11,11 +12,11 @@ import typer
 
 from meshctl.cli.context import InventoryPath, KeyFiles, Lab, Limit, Nodes, selected_nodes
 from meshctl.cli.fleet_view import CONNECT_S, Direct, Timeout, collect, open_fleet_view
-from meshctl.cli.output import echo
+from meshctl.cli.output import echo, echo_error, terminal_width
 from meshctl.errors import ExitCode, InputError
 from meshctl.model import Backend
 from meshctl.status import assess
-from meshctl.status.topology_formats import FORMATS, TopologyView, directions
+from meshctl.status.topology_formats import FORMATS, TopologyView, directions, table, tree
 from meshctl.suggest import did_you_mean
 from meshctl.topology import observed_graph
 from meshctl.topology.cells import link_cells, mesh_reports
@@ -79,7 +80,11 @@ def topology(
         cells=link_cells(fleet, snapshot.observations, snapshot.macs, (mesh,) if mesh else fleet.meshes),
         queried=frozenset(node.name for node in queried) if nodes or limit else None,
     )
-    drawn = FORMATS["json" if as_json else form.value](view)
+    for_people = {TopologyFormat.TABLE: table, TopologyFormat.TREE: tree}
+    if form in for_people and not as_json:
+        drawn = for_people[form](view, terminal_width(sys.stdout))
+    else:
+        drawn = FORMATS["json" if as_json else form.value](view)
     if drawn:
         echo(drawn)
     if not snapshot.observations:
@@ -89,7 +94,7 @@ def topology(
             if is_new
             else "run `meshctl status` for the reason"
         )
-        echo(f"no node answered: {why}", err=True)
+        echo_error(f"no node answered: {why}")
     elif apart := [node.name for node in queried if node.name not in graph]:
-        echo(f"no node reports {', '.join(apart)}; run `meshctl status` for the reason", err=True)
+        echo_error(f"no node reports {', '.join(apart)}; run `meshctl status` for the reason")
     raise typer.Exit(ExitCode.OK if snapshot.observations or not queried else ExitCode.UNREACHABLE)

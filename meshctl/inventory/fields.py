@@ -27,6 +27,7 @@ _NAME = re.compile(r"[A-Za-z0-9](?:[A-Za-z0-9._-]{0,61}[A-Za-z0-9])?")
 _SWITCH_PORTS = "[0-9]{1,2}t?( [0-9]{1,2}t?)*"
 # dev_valid_name() of the kernel: below IFNAMSIZ, and none of these
 _PORT = re.compile(r"[^\s/:,]{1,15}")
+_DEVICE_PATH = re.compile(r"/[^\x00-\x20\x7f]+")
 _MAC = re.compile(r"[0-9A-Fa-f]{2}(?:[:-][0-9A-Fa-f]{2}){5}")
 # characters that text on one line must not contain, as rendering requires
 _CONTROL = re.compile(r"[\x00-\x1f\x7f]")
@@ -114,6 +115,12 @@ def _port(value: str) -> str:
     if _PORT.fullmatch(value):
         return value
     raise expected_error("the name of one port such as eth0.1, without blanks; commas separate ports")
+
+
+def _device_path(value: str) -> str:
+    if _DEVICE_PATH.fullmatch(value):
+        return value
+    raise expected_error("the path of a serial port such as /dev/ttyUSB0 or /dev/serial/by-id/...")
 
 
 def _address(value: object) -> IpAddress:
@@ -212,6 +219,12 @@ Port = Annotated[
     BeforeValidator(_text),
     AfterValidator(_port),
     WithJsonSchema({"type": "string", "pattern": f"^{_PORT.pattern}$"}),
+]
+DevicePath = Annotated[
+    str,
+    BeforeValidator(_text),
+    AfterValidator(_device_path),
+    WithJsonSchema({"type": "string", "pattern": "^/.+"}),
 ]
 Version = Annotated[int, BeforeValidator(_version), WithJsonSchema({"const": FORMAT_VERSION})]
 Window = Annotated[

@@ -12,6 +12,7 @@ from meshctl.inventory.build import build
 from meshctl.inventory.codes import UNKNOWN_MESH
 from meshctl.inventory.include import read_files
 from meshctl.inventory.layers import resolve_layers
+from meshctl.inventory.nodes import without_entries_of
 from meshctl.inventory.source import Reader, read_bytes
 from meshctl.inventory.validate import validate
 from meshctl.model import Fleet
@@ -45,7 +46,8 @@ def load(path: Path, *, environ: Mapping[str, str] = _NO_ENVIRON, read: Reader =
         if validated.document is not None:
             resolved = resolve_layers(validated.document, merged.root)
             built = build(validated.document, merged.root, resolved.nodes, merged.files)
-            problems.extend((*resolved.diagnostics, *built.diagnostics))
+            problems.extend(resolved.diagnostics)
+            problems.extend(without_entries_of(resolved.diagnostics, built.diagnostics))
             fleet = built.fleet
     return Loaded(None if problems else fleet, sorted_diagnostics(problems), files)
 

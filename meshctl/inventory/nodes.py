@@ -5,8 +5,9 @@ Nodes with the same layers (a range) are built once; only name, hostname and add
 
 from __future__ import annotations
 
+import re
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from ipaddress import IPv4Interface, ip_interface
 from pathlib import Path
@@ -35,6 +36,8 @@ from meshctl.model import (
 from meshctl.model.ip import IpAddress, IpInterface, IpNetwork
 from meshctl.suggest import did_you_mean
 
+# comparing names is quadratic in their number
+_MAX_COMPARED = 1000
 # Placeholder in a template until the node's address is known.
 _NO_ADDRESS = IPv4Interface("0.0.0.0/0")
 
@@ -69,7 +72,7 @@ def build_nodes(
     `robot_of` maps nodes to the robots that list them, for nodes without `robot`; `lan_addresses` maps the radios of
     robots with a LAN of their own to their addresses in it; `base` is the inventory's directory.
     """
-    building = _Building(hardware, meshes, _only_meshes(meshes), base)
+    building = _Building(hardware, meshes, _only_meshes(meshes), base, _complete(specs))
     nodes: dict[str, Node] = {}
     for spec in specs.values():
         node = building.node(spec, robot_of.get(spec.name, ""))
@@ -122,6 +125,7 @@ class _Building:
     meshes: Mapping[str, Mesh]
     only_mesh: Mapping[Band, str]
     base: str
+    names: tuple[str, ...] = ()
     diagnostics: list[Diagnostic] = field(default_factory=list)
     _templates: dict[tuple[Layer, ...], _Template | None] = field(default_factory=dict)
     _counts: Counter[Layer] = field(default_factory=Counter)
@@ -160,11 +164,16 @@ class _Building:
 
     def _template(self, spec: NodeSpec) -> _Template | None:
         values = merge_layers(spec.layers, self.base)
-        profile = self._profile(spec, values)
         address_layer = next((layer for layer in spec.layers if "address" in layer.document.model_fields_set), None)
         if address_layer is None:
             hint = "write `address: 10.42.0.11`, or a rule in its group or range: `address: {from: 10.42.0.101}`"
+            # the entry of a node of a range, with another name
+            near = "" if spec.entry.title.startswith("range ") else did_you_mean(spec.name, self.names)
+            hint = f"{near} Or {hint}" if near else hint
             self._report(codes.BAD_ADDRESS, spec.entry, "the node has no address", hint=hint)
+            if near and "hardware" not in values:
+                return None
+        profile = self._profile(spec, values)
         if profile is None or address_layer is None:
             return None
         radios = self._radios(spec, values, profile)
@@ -250,9 +259,16 @@ class _Building:
                 if (layer, str(reason)) in self._wrong_rules:
                     return None
                 self._wrong_rules.add((layer, str(reason)))
-                self._report(codes.BAD_ADDRESS, layer, f"{reason} (node '{spec.name}')", below=("address",))
+                hint = self._bands(template.node) if template.network is None else ""
+                self._report(codes.BAD_ADDRESS, layer, f"{reason} (node '{spec.name}')", below=("address",), hint=hint)
                 return None
         return ip_interface((value, self._prefix_length(value, template.network)))
+
+    def _bands(self, node: Node) -> str:
+        """A hint for a node that is in no mesh: `radio0 is 5g, and mesh main is 2g`."""
+        radios = ", ".join(f"{radio.name} is {radio.hardware.band.value}" for radio in node.radios)
+        meshes = ", ".join(f"mesh {mesh.name} is {mesh.band.value}" for mesh in self.meshes.values())
+        return f"{radios}, and {meshes}" if radios and meshes else ""
 
     def _prefix_length(self, address: IpAddress, network: IpNetwork | None) -> int:
         """The prefix length of the node's mesh, or that of a mesh with the address; else all bits."""
@@ -276,6 +292,29 @@ class _Building:
         )
         if diagnostic not in self.diagnostics[-8:]:
             self.diagnostics.append(diagnostic)
+
+
+def without_entries_of(refused: Iterable[Diagnostic], found: Iterable[Diagnostic]) -> Iterator[Diagnostic]:
+    """Without what the entries of nodes lack whose range was refused: the range would give it to them."""
+    starts = tuple(
+        re.split(r"[^A-Za-z0-9._-]", one.path.removeprefix("nodes."))[0]
+        for one in refused
+        if one.code == codes.BAD_RANGE and one.path.startswith("nodes.")
+    )
+    for one in found:
+        is_entry = one.path.startswith("nodes.") and one.path.count(".") == 1
+        if not (is_entry and starts and one.path.removeprefix("nodes.").startswith(tuple(filter(None, starts)))):
+            yield one
+
+
+def _complete(specs: Mapping[str, NodeSpec]) -> tuple[str, ...]:
+    """The nodes with an address, whose names others may have misspelled; none if they are too many to compare."""
+    names = tuple(
+        spec.name
+        for spec in specs.values()
+        if any("address" in layer.document.model_fields_set for layer in spec.layers)
+    )
+    return names if len(names) <= _MAX_COMPARED else ()
 
 
 def _only_meshes(meshes: Mapping[str, Mesh]) -> dict[Band, str]:

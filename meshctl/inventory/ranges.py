@@ -13,6 +13,8 @@ MAX_NAMES = 100_000
 
 _PART = re.compile(r"\[([^\[\]]*)\]")
 _ITEM = re.compile(r"(\d{1,9})(?:-(\d{1,9}))?|([A-Za-z0-9._]+)")
+# a span as other programs write it
+_DOTTED = re.compile(r"(\d{1,9})\.{2,3}(\d{1,9})")
 
 
 class BadRange(ValueError):
@@ -51,6 +53,8 @@ def _choices(body: str) -> tuple[str, ...]:
         if match is None:
             raise BadRange(f"invalid item '{item.strip()}'")
         first, last, word = match.groups()
+        if word is not None and (dotted := _DOTTED.fullmatch(word)) is not None:
+            raise BadRange(f"'{word}' is a word: write {dotted[1]}-{dotted[2]} for a span of numbers")
         if word is not None:
             made.append(word)
             continue

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from types import UnionType
 from typing import Annotated, Any, Union, get_args, get_origin
@@ -16,7 +16,7 @@ from meshctl.inventory import codes
 from meshctl.inventory.compose import printable
 from meshctl.inventory.documents import InventoryDocument, SecretDocument
 from meshctl.inventory.tree import MappingNode, Scalar, Tree, child, describe, key_position, plain_data, position
-from meshctl.suggest import did_you_mean, nearest
+from meshctl.suggest import did_you_mean, nearest, suggestion
 
 _REFERENCE = "a reference: {env: NAME}, {file: PATH, key: NAME} or {age: PATH, key: NAME}"
 # Values of these keys may be secrets in place of references; messages never repeat them.
@@ -61,6 +61,10 @@ _UNITS = {
     "_s": "seconds",
     "_tu": "time units of 1.024 ms",
 }
+# Keys whose values are shares of a whole.
+_SHARES = frozenset({"quorum", "duty_cycle", "scale"})
+_PERCENT = re.compile(r"([0-9]{1,3}(?:\.[0-9]{1,6})?) ?%?")
+_DECIMAL_COMMA = re.compile(r"[-+]?[0-9]{1,9},[0-9]{1,9}")
 _WITH_UNIT = re.compile(r"[-+]?[0-9.,]+ ?[A-Za-z]{1,8}(/s)?")
 
 
@@ -89,9 +93,15 @@ def _without_misspelled(errors: list[ErrorDetails]) -> list[ErrorDetails]:
     meant = {
         (*parent, near)
         for *parent, wrong in (error["loc"] for error in errors if error["type"] == "extra_forbidden")
-        for near in nearest(str(wrong), _known_keys(parent))
+        for near in _meant(str(wrong), _known_keys(parent))
     }
     return [error for error in errors if error["type"] != "missing" or error["loc"] not in meant]
+
+
+def _meant(wrong: str, known: Sequence[str]) -> tuple[str, ...]:
+    """The keys that an unknown one probably is: the same with its unit (`x` for `x_m`), else the most similar ones."""
+    with_unit = tuple(f"{wrong}{unit}" for unit in _UNITS if f"{wrong}{unit}" in known)
+    return with_unit or nearest(wrong, known)
 
 
 def _diagnostic(root: MappingNode, error: ErrorDetails) -> Diagnostic:
@@ -108,7 +118,7 @@ def _diagnostic(root: MappingNode, error: ErrorDetails) -> Diagnostic:
     if kind == "extra_forbidden":
         known = _known_keys(path[:-1])
         wrong = str(path[-1])
-        hint = did_you_mean(wrong, known) or f"known keys: {', '.join(known)}"
+        hint = suggestion(_meant(wrong, known)) or f"known keys: {', '.join(known)}"
         if _is_rest_of_a_text(root, path):
             hint = "a comma ends a text within {}: if this belongs to the text before it, quote the whole text"
         return codes.error(codes.UNKNOWN_KEY, place, f"unknown key '{printable(wrong)}'", path=dotted, hint=hint)
@@ -178,9 +188,17 @@ def _found(root: MappingNode, path: tuple[int | str, ...], kind: str) -> str:
     if tree is None:
         return ""
     is_secret = any(part in _SECRET_KEYS for part in path)
+    if isinstance(tree, MappingNode) and tree.values and not is_secret and kind not in _CONTAINERS:
+        # a rule of several keys: `{rule: network + x}`, or the settings of a thin link
+        return "{" + ", ".join(printable(_entry_text(key, value)) for key, value in tree.values.items()) + "}"
     if not isinstance(tree, Scalar) or tree.is_null or is_secret or kind in _CONTAINERS:
         return describe(tree)
     return f"'{printable(tree.text)}'" if tree.is_plain else f'"{printable(tree.text)}" in quotes'
+
+
+def _entry_text(key: str, value: Tree) -> str:
+    is_shown = isinstance(value, Scalar) and key not in _SECRET_KEYS
+    return f"{key}: {value.text}" if is_shown and isinstance(value, Scalar) else f"{key}: ..."
 
 
 def _enum_hint(root: MappingNode, path: tuple[int | str, ...], error: ErrorDetails) -> str:
@@ -194,7 +212,15 @@ def _unit_hint(root: MappingNode, path: tuple[int | str, ...]) -> str:
     tree: Tree | None = root
     for part in path:
         tree = None if tree is None else child(tree, part)
-    if not isinstance(tree, Scalar) or not _WITH_UNIT.fullmatch(tree.text):
+    if not isinstance(tree, Scalar):
+        return ""
+    if path[-1] in _SHARES and (percent := _PERCENT.fullmatch(tree.text)) is not None and float(percent[1]) > 1:
+        return f"a share from 0 to 1: {percent[1]} % is {float(percent[1]) / 100:g}"
+    if _DECIMAL_COMMA.fullmatch(tree.text):
+        return f"write a point: {tree.text.replace(',', '.')}"
+    if tree.is_plain and tree.text.lower() in ("none", "no", "off") and path[-1] in ("gateway", "lan_filter", "mesh"):
+        return "write `null` to remove the value of an earlier layer"
+    if not _WITH_UNIT.fullmatch(tree.text):
         return ""
     unit = next((unit for suffix, unit in _UNITS.items() if str(path[-1]).endswith(suffix)), "")
     return f"write the number alone; it is in {unit}" if unit else ""

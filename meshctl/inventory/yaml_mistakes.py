@@ -19,6 +19,9 @@ from meshctl.wording import counted
 
 # the parser stops at the bracket of a name such as b[01-12] in flow style
 _RANGE_IN_BRACES = re.compile(r"[{,]\s*[\w.-]+\[$")
+# and behind that of a name in a list: [b[01-12]]
+_RANGE_IN_LIST = re.compile(r"\[(?:[^\[\]]*,)?\s*[\w.-]+\[[^\[\]]*\]?\]?$|\[(?:[^\[\]]*,)?\s*[\w.-]+\[$")
+_MISSING_COMMA = re.compile(r"[{,]\s*[\w.-]+: +[^\s,{}\[\]:]+[ ;]+[\w.-]+:$")
 _CONFLICT = re.compile(r"(<{7}|>{7}) ")
 # spaces that YAML takes for letters: browsers, PDF files and chats put them in
 _ODD_SPACE = re.compile("[\u00a0\u1680\u2000-\u200b\u202f\u205f\u2060\u3000\ufeff]")
@@ -69,8 +72,12 @@ def _hint(before: str) -> str:
     """A hint for common mistakes in the line up to the error."""
     if "\t" in before:
         return "indent YAML with spaces, not tabs"
+    if _RANGE_IN_LIST.search(before):
+        return 'quote a range in a list: ["b[01-12]"]'
     if _RANGE_IN_BRACES.search(before):
         return 'quote a range inside braces: {"b[01-12]": ...}'
+    if _MISSING_COMMA.search(before):
+        return "separate entries with commas; quote a value that contains a colon and a space"
     if before.endswith(":") and before.count(": ") > 0:
         return "quote a value that contains a colon and a space"
     if before.endswith(("@", "`", "%")):

@@ -19,6 +19,7 @@ from meshctl.lint.rules import (
     drivers,
     encryption,
     extra_dhcp,
+    extra_firewall,
     extra_interfaces,
     extra_networks,
     extra_radios,
@@ -102,6 +103,7 @@ CHAPTERS: tuple[tuple[str, ModuleType], ...] = (
     ("Further radios", extra_radios),
     ("Further interfaces", extra_interfaces),
     ("Further address servers", extra_dhcp),
+    ("Further firewall zones", extra_firewall),
 )
 
 

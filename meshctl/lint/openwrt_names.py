@@ -57,7 +57,9 @@ PACKAGES = frozenset(FULL_SUPPLICANTS) | _words(
     kmod-ath6kl kmod-ath9k kmod-ath9k-htc kmod-ath10k kmod-ath10k-ct kmod-ath10k-ct-smallbuffers kmod-ath11k kmod-mt76
     kmod-mt7603 kmod-mt7615e kmod-mt7915e kmod-mac80211 kmod-cfg80211 ethtool tcpdump tcpdump-mini ip-full ip-tiny
     ip-bridge iperf3 iperf fping mtr-json dnsmasq dropbear firewall firewall4 odhcpd-ipv6only odhcp6c ppp-mod-pppoe
-    luci luci-ssl uhttpd zoneinfo-core openssh-sftp-server rsync collectd socat alfred batmand olsrd babeld snmpd
+    luci luci-ssl luci-app-statistics luci-app-firewall luci-app-banip uhttpd kmod-nft-bridge kmod-nft-core kmod-nft-nat
+    nftables nftables-json nftables-nojson iptables-nft zoneinfo-core openssh-sftp-server rsync collectd socat alfred
+    batmand olsrd babeld snmpd
     lldpd"""
 )
 # shorter names are similar to too many others
@@ -89,6 +91,9 @@ def suggest_packages(name: str) -> tuple[str, ...]:
         return (hyphened,)
     if len(name) < _MIN_LETTERS:
         return ()
+    # a kernel module's name as in the kernel
+    if f"kmod-{hyphened}" in PACKAGES:
+        return (f"kmod-{hyphened}",)
     # a kernel module whose name was cut, such as kmod-batman
     longer = [known for known in PACKAGES if name.startswith("kmod-") and known.startswith(f"{name}-")]
     if len(longer) == 1:

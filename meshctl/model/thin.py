@@ -124,6 +124,11 @@ class ThinLink:
         return min(self.frame_bytes, int(room + 1e-9) - self.framing.overhead_bytes)
 
     @property
+    def longest_name_bytes(self) -> int:
+        """Longest name of a robot that fits a frame beside what introduces the robot."""
+        return self.largest_frame_bytes - PRESENCE_OVERHEAD_BYTES
+
+    @property
     def largest_message_bytes(self) -> int:
         """Type name and payload of the largest message that it carries."""
         return MAX_PARTS * (self.largest_frame_bytes - PART_OVERHEAD_BYTES)
@@ -136,6 +141,8 @@ MAX_2400_MHZ_FRAME_BYTES = 100
 MAX_PARTS = 32
 PART_OVERHEAD_BYTES = 17
 """Of a frame with one part of a message: header and tag 8, header of the part 9."""
+PRESENCE_OVERHEAD_BYTES = 28
+"""Of the frame by which a robot introduces itself, besides its name, with one robot that it hears."""
 BURST_SHARE, URGENT_SHARE = 0.25, 0.25
 """Of the allowed airtime udp_mesh sends the one at once, and keeps the other for urgent messages."""
 

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 
 from meshctl.diagnostics import Diagnostic, InvalidInput, Severity
 from meshctl.resolve import Intent
+from meshctl.suggest import did_you_mean
 from meshctl.uci import Package, Section
 
 # Options that cannot be set (docs/render.md).
@@ -29,12 +30,22 @@ def with_extra(packages: Mapping[str, Package], intent: Intent) -> dict[str, Pac
             result[name] = _set_option(package, section, option, value) if option else _make(package, section, value)
         except ValueError as error:
             place = intent.extra_positions.get(key, intent.position)
-            failed.append(
-                Diagnostic(EXTRA, Severity.ERROR, place, f"cannot be set: {error}", f"extra_uci.{key}", hint=_HINT)
-            )
+            message = f"cannot be set: {error}"
+            hint = _hint(package, section) if option else _HINT
+            failed.append(Diagnostic(EXTRA, Severity.ERROR, place, message, f"extra_uci.{key}", hint=hint))
     if failed:
         raise InvalidInput(failed)
     return result
+
+
+def _hint(package: Package, section: str) -> str:
+    """For an option of a section that is not there: how to create it, and the names of similar ones."""
+    keys = package.keys()
+    if f"@{section}[0]" in keys:
+        return f"did you mean '@{section}[0]'?"
+    near = did_you_mean(section, [key for key in keys if not key.startswith("@")])
+    create = f"create the section with a key of its own, `{package.name}.{section}: TYPE`"
+    return f"{create}, or correct the name: {near}" if near else f"{create}, or correct the name"
 
 
 def _make(package: Package, name: str, type_name: str) -> Package:

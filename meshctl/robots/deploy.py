@@ -282,7 +282,9 @@ def parse_switch(robot: str, release: str, output: str) -> Outcome:
         case "rolled-back-ill":
             still = fields.get("still", "") or "it does not become healthy"
             why = f"{reason}; the previous release is not healthy either: {still}"
-            return Outcome(robot, Result.ROLLED_BACK, why, hint)
+            # a peer that was switched off meanwhile, or a link that broke
+            again = "the new release may not be the cause: run the command again" if still == reason else ""
+            return Outcome(robot, Result.ROLLED_BACK, why, "\n".join(filter(None, (again, hint))))
         case "removed":
             return Outcome(robot, Result.ROLLED_BACK, f"{reason}; removed, since there is no previous release", hint)
         case _:

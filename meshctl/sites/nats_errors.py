@@ -12,9 +12,12 @@ _REFUSED = "permissions violation"
 _REFUSED_HINT = "the server's configuration has to permit it: docs/how-to/permanent-sites.md"
 _KEPT_REFUSALS = 64
 # Codes of JetStream errors that room on the server's disk, or in its limits, cures: its limits are reached (in memory,
-# on disk, of its account), and a message could not be stored.
-_NO_ROOM = (10002, 10023, 10028, 10047, 10077)
-_ROOM_HINT = "make room on the disk of the NATS server, or raise its `max_file_store`; it reserves 100 MB for each site"
+# on disk, of its account), a stream's files could not be made, and a message could not be stored.
+_NO_ROOM = (10002, 10023, 10028, 10047, 10049, 10077)
+_ROOM_HINT = (
+    "make room on the disk of the NATS server, or make it writable, or raise its `max_file_store`; it reserves 100 MB"
+    " for each site"
+)
 _NO_JETSTREAM_HINT = (
     "it is off, its disk is full or read-only, or the leaf node and the hub are not connected: "
     "look at the servers' logs"

@@ -7,10 +7,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
+from meshctl.report import text_table
 from meshctl.report.duration import duration
+from meshctl.report.line_wrap import wrap
 from meshctl.topology import Graph, Report, heard_by_name
 from meshctl.topology.cells import LinkCell
 from meshctl.wording import counted
@@ -76,27 +78,34 @@ def _share(value: float | None) -> str:
     return "-" if value is None else f"{value:.0%}"
 
 
-def table(view: TopologyView) -> str:
-    """One line per link, weakest first."""
-    lines = [("link", "there", "back", "signal", "heard", "cell")]
+def table(view: TopologyView, width: int | None = None) -> str:
+    """One line per link, weakest first; columns are left out, and notes wrapped, to fit `width`."""
+    rows = []
     for link in sorted(view.graph.links, key=lambda link: (link.quality, link.a, link.b)):
         there, back = view.direction(link.a, link.b), view.direction(link.b, link.a)
         signals = "/".join("-" if d.signal_dbm is None else str(d.signal_dbm) for d in (there, back))
         ages = [d.age_ms for d in (there, back) if d.age_ms is not None]
-        lines.append(
+        rows.append(
             (f"{link.a} -- {link.b}", _share(there.quality), _share(back.quality), signals,
              f"{max(ages)} ms ago" if ages else "-",
              "wired" if link.wired else ", ".join(map(str, view.cells_of(link.a, link.b))))
         )  # fmt: skip
-    widths = [max(len(line[column]) for line in lines) for column in range(len(lines[0]))]
-    links = ["  ".join(c.ljust(w) for c, w in zip(line, widths, strict=True)).rstrip() for line in lines]
+    heading = ("link", "there", "back", "signal", "heard", "cell")
+    links = text_table.lines(heading, rows, width, leave_out=("heard", "signal", "cell"))
     cut_off_by = view.graph.cut_off_by_any(view.entries)
     notes = [f"cut vertex: {name} (connects {', '.join(lost)})" for name, lost in cut_off_by.items()]
-    return "\n".join([*links, *notes])
+    return "\n".join([*links, *(part for note in notes for part in wrap(note, width))])
 
 
-def tree(view: TopologyView) -> str:
-    """Each node below its next hop to the entry; cut vertices are marked with a star."""
+def tree(view: TopologyView, width: int | None = None) -> str:
+    """Each node below its next hop to the entry; cut vertices are marked with a star. Without cells if they do not fit
+    into `width`."""
+    if width is not None and view.has_several_cells():
+        whole = tree(view)
+        if max(map(len, whole.splitlines()), default=0) > width:
+            parts = [*tree(replace(view, cells={})).splitlines(), "cells not shown (use --json)"]
+            return "\n".join(part for line in parts for part in wrap(line, width))
+        return whole
     paths = view.graph.paths_to_any(view.entries)
     children: dict[str, list[str]] = {}
     for name, path in sorted(paths.items()):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable
 
 from meshctl.device.observation import Observation, Originator
 from meshctl.topology.observed import HeardNeighbor, Report
@@ -24,21 +24,23 @@ def report_of(node: str, observation: Observation) -> Report:
             if station.can_forward
         ]
         return Report(node, mesh_macs(observation), tuple(heard))
-    paths = _paths(observation.originators or ())
+    originators = observation.originators or ()
+    direct = _direct_qualities(originators)
     return Report(
         node,
         mesh_macs(observation),
         tuple(
-            _heard(mac, neighbor.last_seen_ms, signals.get(mac), paths.get(mac, {}))
+            HeardNeighbor(
+                mac,
+                neighbor.last_seen_ms,
+                direct.get(mac),
+                signals.get(mac),
+                {} if mac in direct else _paths_through(mac, originators),
+            )
             for neighbor in observation.neighbors
             for mac in (neighbor.mac.lower(),)
         ),
     )
-
-
-def _heard(mac: str, last_seen_ms: int, signal_dbm: int | None, paths: Mapping[str, float]) -> HeardNeighbor:
-    others = {originator: quality for originator, quality in paths.items() if originator != mac}
-    return HeardNeighbor(mac, last_seen_ms, paths.get(mac), signal_dbm, others)
 
 
 def mesh_macs(observation: Observation) -> tuple[str, ...]:
@@ -49,19 +51,25 @@ def mesh_macs(observation: Observation) -> tuple[str, ...]:
     return tuple(dict.fromkeys(mac.lower() for mac in macs if mac))
 
 
-def _paths(originators: tuple[Originator, ...]) -> dict[str, dict[str, float]]:
-    """Next hop's MAC -> originator's MAC -> quality; the direct link where both are the same."""
-    paths: dict[str, dict[str, float]] = {}
-    for mac, next_hop, _, _, _, tq, throughput_kbit_s in originators:
-        if tq is not None:
-            value = tq / TQ_MAX
-        elif throughput_kbit_s is not None:
-            value = throughput_kbit_s / FULL_THROUGHPUT_KBIT_S
+def _direct_qualities(originators: Iterable[Originator]) -> dict[str, float]:
+    """The quality of the direct link to each neighbor, by MAC. A table has a row for each radio of a whole mesh: only
+    those of neighbors are evaluated."""
+    return _best((row.mac, row) for row in originators if row.mac == row.next_hop)
+
+
+def _paths_through(mac: str, originators: Iterable[Originator]) -> dict[str, float]:
+    """The quality of the path to each originator behind a neighbor, by MAC."""
+    return _best((row.mac, row) for row in originators if row.next_hop == mac)
+
+
+def _best(rows: Iterable[tuple[str, Originator]]) -> dict[str, float]:
+    best: dict[str, float] = {}
+    for mac, row in rows:
+        if row.tq is not None:
+            quality = row.tq / TQ_MAX
+        elif row.throughput_kbit_s is not None:
+            quality = row.throughput_kbit_s / FULL_THROUGHPUT_KBIT_S
         else:
             continue
-        best = paths.get(next_hop)
-        if best is None:
-            best = paths[next_hop] = {}
-        known = best.get(mac, 0.0)
-        best[mac] = known if known >= value else value if value < 1.0 else 1.0
-    return paths
+        best[mac] = max(best.get(mac, 0.0), min(quality, 1.0))
+    return best

@@ -5,16 +5,18 @@ from __future__ import annotations
 import hashlib
 import json
 import shlex
+import sys
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from meshctl.cli.context import AsJson, LabDirectory, lab_directory
-from meshctl.cli.output import echo, echo_json, write_file
+from meshctl.cli.output import echo, echo_json, terminal_width, write_file
 from meshctl.device.framing import command_line
 from meshctl.errors import InputError
 from meshctl.model import Backend, Fleet, Release
+from meshctl.report import text_table
 from meshctl.resources import shipped
 from meshctl.wording import counted
 from meshlab.cli import links, sweep
@@ -69,6 +71,9 @@ def up(
     if copy.kept is not None:
         echo(f"kept:      {copy.kept}, the earlier copy of the inventory, which was edited")
     echo(f"inventory: {copy.inventory}")
+    if copy.hosts:
+        computers = counted(len(copy.hosts), "computer")
+        echo(f"removed:   ssh.host of {computers}, in this copy only: no command reaches the real robots")
     lab, inventory_path = shlex.quote(str(place)), shlex.quote(str(copy.inventory))
     echo(f"use it:    export MESHCTL_LAB={lab} MESHCTL_INVENTORY={inventory_path}")
     echo(f"console:   meshctl lab shell {fleet.spec.names[0]}")
@@ -113,11 +118,10 @@ def status(directory: LabDirectory = None, as_json: AsJson = False) -> None:
         return
     echo(f"{state['fleet']}: process {state['pid']}, port {state['port']}")
     head = ("NODE", "POWER", "RELEASE", "ADDRESS", "PLUGGED", "MESH", "REACHED AT", "FAULTS")
-    rows: list[tuple[str, ...]] = [head]
-    rows += [_row(node) for node in state["nodes"]]
-    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
-    for row in rows:
-        echo("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+    rows = [_row(node) for node in state["nodes"]]
+    leave_out = ("RELEASE", "REACHED AT", "PLUGGED", "FAULTS")
+    for line in text_table.lines(head, rows, terminal_width(sys.stdout), leave_out=leave_out):
+        echo(line)
     for link in state["links"]:
         if not link["up"]:
             echo(f"link {'-'.join(link['between'])} is down")

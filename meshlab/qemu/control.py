@@ -13,10 +13,10 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from meshctl.device.connection import Completed
-from meshlab.client import request
+from meshlab.client import MACHINE_ANSWER_S, request
 
 
-def run(directory: Path, command: str, *, timeout_s: float = 60.0) -> Completed:
+def run(directory: Path, command: str, *, timeout_s: float = MACHINE_ANSWER_S) -> Completed:
     """Run a shell command as root in the machine, outside every node, with iproute2, iw, batctl and busybox."""
     with tempfile.TemporaryFile() as source, tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
         descriptors = (source.fileno(), out.fileno(), err.fileno())

@@ -75,6 +75,17 @@ def operator_lan(spec: FleetSpec) -> LanSpec | None:
     return next((lan for lan in spec.lans if base in lan.nodes), None)
 
 
+def is_on_operator_lan(hardware: NodeHardware, spec: FleetSpec) -> bool:
+    """Whether the node is a base whose cable always leads to the operator's machine. Any other base has a cable of its
+    own on the bench: on one LAN, two factory devices answer at 192.168.1.1."""
+    is_base = spec.nodes[hardware.number].medium is Medium.BASE
+    lan = operator_lan(spec)
+    if not is_base or lan is None or hardware.lan is not lan:
+        return False
+    first = next(node.name for node in spec.nodes if node.medium is Medium.BASE)
+    return hardware.name == first
+
+
 def prepare(spec: FleetSpec, country: str = "US") -> None:
     """Create what must exist before any node boots: switches and robots' computers."""
     batch = ["link set lo up"]

@@ -70,10 +70,11 @@ class QemuLinkState(LinkState):
     def _connect_cable(self, state: NodeState) -> None:
         if state.pid <= 0:
             return
-        on_bench = state.plugged and not self._is_base(state)
+        hardware = self._hardware[state.spec.name]
+        on_bench = state.plugged and not hwsim_devices.is_on_operator_lan(hardware, self._fleet.spec)
         cabled = (state.boots, on_bench)
         if self._cabled.get(state.spec.name) != cabled:
-            hwsim_devices.connect_cable(self._hardware[state.spec.name], self._fleet.spec, on_bench=on_bench)
+            hwsim_devices.connect_cable(hardware, self._fleet.spec, on_bench=on_bench)
             self._cabled[state.spec.name] = cabled
 
     def _impair_node(self, state: NodeState) -> None:

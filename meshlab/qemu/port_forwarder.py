@@ -21,7 +21,6 @@ from meshlab.port_forwarder import ForwardedPort, PortForwarder
 from meshlab.qemu import hwsim_devices
 from meshlab.spec import Medium
 
-_SSH_PORT = 22
 # the kernel gives up unanswered ARP after 3 s, and retransmits a lost SYN after 1, 3 and 7 s
 _DIAL_S = 10.0
 _FACTORY_PREFIX = 24
@@ -66,21 +65,28 @@ class QemuPortForwarder(PortForwarder):
         state = self._fleet.nodes[port.node]
         if state.hung:
             raise TimeoutError(f"{port.node} accepts connections but does not answer")
+        *others, last = state.spec.ssh_ports
+        for number in others:
+            with contextlib.suppress(ConnectionRefusedError):
+                return await self._connected(host, port, number)
+        return await self._connected(host, port, last)
+
+    async def _connected(self, host: str, port: ForwardedPort, number: int) -> socket.socket:
         made = self._socket(port)
         made.setblocking(False)
         made.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         try:
             async with asyncio.timeout(_DIAL_S):
-                await self._wait_connected(made, host, port)
+                await self._wait_connected(made, host, port, number)
         except BaseException:
             made.close()
             raise
         return made
 
-    async def _wait_connected(self, made: socket.socket, host: str, port: ForwardedPort) -> None:
+    async def _wait_connected(self, made: socket.socket, host: str, port: ForwardedPort, number: int) -> None:
         """Wait until the socket is connected. Raises LabError as soon as the port's target changes: a node that gave up
         an address does not reject packets to it."""
-        connecting = asyncio.ensure_future(asyncio.get_running_loop().sock_connect(made, (port.address, _SSH_PORT)))
+        connecting = asyncio.ensure_future(asyncio.get_running_loop().sock_connect(made, (port.address, number)))
         moving = asyncio.ensure_future(self._wait_moved(host, port))
         try:
             await asyncio.wait((connecting, moving), return_when=asyncio.FIRST_COMPLETED)
@@ -107,8 +113,8 @@ class QemuPortForwarder(PortForwarder):
         prefix = next((a.prefix for a in state.effective.addresses if a.address == port.address), _FACTORY_PREFIX)
         address = IPv4Interface(f"{port.address}/{prefix}")
         by_wire = self._link_state.bench_shape(port.node, port.address) is not None
-        if by_wire and state.spec.medium is not Medium.BASE:
-            hardware = self._hardware[port.node]
+        hardware = self._hardware[port.node]
+        if by_wire and not hwsim_devices.is_on_operator_lan(hardware, self._fleet.spec):
             _add_address(hardware.cable, hwsim_devices.operator_address(address, hardware.number))
             made = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
             made.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, hardware.cable.encode())

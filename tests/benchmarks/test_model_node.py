@@ -51,7 +51,6 @@ def test_stdin_is_read_only_for_commands_that_take_input() -> None:
 
 
 @pytest.mark.lab
-@pytest.mark.timeout(300)
 def test_meshctl_changes_a_model_node_with_four_commands(tmp_path: Path) -> None:
     fleet = ModelFleet(tmp_path, 1)
     command = [sys.executable, "-m", "meshctl", "provision", "--yes", "--json", "-i", str(fleet.inventory("b"))]

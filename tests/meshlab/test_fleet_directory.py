@@ -123,6 +123,28 @@ def test_secrets_beside_the_inventory_are_still_found_from_the_copy(tmp_path: Pa
     assert [store.get(key).reveal() for key in fleet.udp_mesh.keys] == ["inside", "outside, too"]
 
 
+def test_the_copy_does_not_lead_to_the_real_robots(tmp_path: Path) -> None:
+    project = tmp_path / "project"
+    shutil.copytree(shipped("inventory") / "subt-final", project)
+    path = project / "fleet.yaml"
+    text = path.read_text(encoding="utf-8")
+    hosts = {"husky1": "husky1.example", "husky2": "10.9.8.7", "spot1": "127.0.0.9"}
+    for robot, host in hosts.items():
+        text = re.sub(rf"(\n  {robot}:.*?ssh: {{)", rf"\1host: {host}, ", text, count=1, flags=re.DOTALL)
+    path.write_text(text, encoding="utf-8")
+    copy = copy_inventory(project, tmp_path / "lab")
+    kept = {name: robot.computer.ssh.host for name, robot in copy.fleet.robots.items() if robot.computer}
+    assert (kept["husky1"], kept["husky2"], kept["spot1"]) == ("", "", "127.0.0.9")
+    assert copy.hosts == ("husky1.example", "10.9.8.7")
+    assert "husky1.example" in path.read_text(encoding="utf-8")
+    # what the user sets in the copy, a test machine, stays
+    edited = copy.inventory / "fleet.yaml"
+    edited.write_text(edited.read_text(encoding="utf-8").replace('host: ""', "host: test.example", 1), encoding="utf-8")
+    again = copy_inventory(copy.inventory, tmp_path / "lab")
+    assert again.hosts == ()
+    assert "host: test.example" in edited.read_text(encoding="utf-8")
+
+
 def test_secrets_that_are_not_there_yet_are_expected_beside_the_copy(tmp_path: Path) -> None:
     project = tmp_path / "project"
     shutil.copytree(EXAMPLE, project / "inventory")

@@ -17,7 +17,7 @@ from tests.meshctl.proof.rig import Rig
 from tests.meshlab.conftest import in_mesh
 from tests.waiting import until
 
-pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("lab"), pytest.mark.timeout(600)]
+pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("lab")]
 
 # long enough for a reload on a busy machine
 WINDOW_S = 40

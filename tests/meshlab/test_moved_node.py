@@ -8,7 +8,7 @@ import pytest
 
 from tests.meshctl.proof.rig import Rig
 
-pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("lab"), pytest.mark.timeout(600)]
+pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("lab")]
 
 MOVED = """\
   n001: {address: 10.43.1.1, radios: {radio0: {mesh: second}}}

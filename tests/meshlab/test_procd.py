@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import time
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from meshlab.fleet import VirtualFleet, VirtualNode
+from meshlab.spec import FleetSpec, NodeSpec
 from tests.meshlab.conftest import answers, connect, run
 from tests.waiting import until
 
@@ -102,6 +104,16 @@ def test_dropbear_is_listed_like_in_procd_and_restarted_only_on_a_command_change
     assert not answers(node.bench)
     assert run(transport, "echo still here") == "still here\n"
     transport.close()
+
+
+def test_an_ssh_server_on_the_inventory_s_port_is_reached_there_and_at_the_factory_s(tmp_path: Path) -> None:
+    with VirtualFleet(FleetSpec("ports", (NodeSpec("box", ssh_port=2222),)), tmp_path) as fleet:
+        node = fleet.node("box")
+        before = dropbear(node)["pid"]
+        connect(node.bench).close()
+        node.exec("uci set dropbear.@dropbear[0].Port=2222; uci commit; reload_config").check("change")
+        until(lambda: dropbear(node).get("pid", before) != before, "another process")
+        until(lambda: answers(node.bench), "the SSH server at its new port")
 
 
 @pytest.mark.parametrize(

@@ -18,6 +18,8 @@ from udp_mesh.core.receiver.replay_check import (
     broadcast_lateness_s,
     data_lateness_s,
     long_lateness_s,
+    on_fresh_broadcast,
+    on_fresh_data,
     small_frames,
     timestamp_of,
 )
@@ -91,7 +93,7 @@ def receive_datagram(state: State, data: bytes | memoryview, link: str, source: 
                 session.received_bytes += size + IP_UDP_BYTES
                 _receive_data(state, session, number, frames, link, source, now)
             else:
-                _receive_broadcast(state, session, frames, link, source, now)
+                _receive_broadcast(state, session, number, frames, link, source, now)
             return
         if replayed is not None:
             counters.dropped_replayed += 1
@@ -132,6 +134,7 @@ def _receive_data(
         late_s = data_lateness_s(state, session, frames, link, source, now)
         if late_s is None:
             return
+        on_fresh_data(session, number, now)
     if (
         peer is not None
         and peer.state is _ONLINE
@@ -176,7 +179,9 @@ def _receive_data(
     process_frames(state, session, decoded, number, link, source, now, late_s or 0.0)
 
 
-def _receive_broadcast(state: State, session: Session, frames: bytes, link: str, source: Address, now: float) -> None:
+def _receive_broadcast(
+    state: State, session: Session, number: int, frames: bytes, link: str, source: Address, now: float
+) -> None:
     """Process a broadcast datagram. Until the sender is verified and its floor known, it may be replayed."""
     peer = session.peer
     if peer is None or peer.session is not session or session.boot_id not in state.repairs:
@@ -188,6 +193,7 @@ def _receive_broadcast(state: State, session: Session, frames: bytes, link: str,
     late_s = broadcast_lateness_s(state, session, frames, link, source, now)
     if late_s is None:
         return
+    on_fresh_broadcast(session, number)
     on_activity(state, session, link, source, now)
     try:
         decoded = decode(frames)
@@ -251,6 +257,7 @@ def _receive_long(
     if late_s is None:
         return
     if not introduced:
+        on_fresh_broadcast(session, number)
         if beat is not None:
             on_heartbeat(state, session, beat, link, source, now, to_all=True)
         for frame in decoded:
@@ -259,6 +266,7 @@ def _receive_long(
         if session.held and session.verified:
             _release_held(state, session, now)
         return
+    on_fresh_data(session, number, now)
     if not session.verified:
         if beat is not None:
             session.update_from(beat, now)

@@ -39,8 +39,6 @@ LAST_ARRIVAL_S = 0.0003
 """A datagram this recent is taken to be the last one waiting; reading again would cost as much as receiving."""
 MAX_CLOCK_GAP_S = 50e-6
 """Two clock readings within this interval count as simultaneous."""
-MAX_DRAIN_S = 0.5
-"""Reading a batch takes milliseconds; even on a busy machine it takes no longer than this."""
 MAX_PUMP_BYTES = 1 << 18
 """Bytes sent before the sockets get their turn again."""
 INTERFACE_DEBOUNCE_S = 0.05
@@ -311,14 +309,15 @@ class Driver:
         return after
 
     def _deliver(self, data: memoryview, source: Address, arrived: float) -> None:
-        # Never earlier than the time already passed to the core, and at most `MAX_DRAIN_S` after the drain started: a
-        # later stamp means that the wall clock was set, and then (as without a stamp) the time of reading is used.
+        # Never earlier than the time already passed to the core, and never in the future: a later stamp means that the
+        # wall clock was set, and then (as without a stamp) the time of reading is used.
         assert self._wall_offset is not None
         at = arrived - self._wall_offset if arrived else self._drained_at
         if at < self._now:
             at = self._now
-        elif at > self._drained_at + MAX_DRAIN_S:
-            at = self._drained_at
+        elif at > self._drained_at:
+            # it may have arrived since the drain started
+            at = min(at, self._clock())
         self._now = at
         self.node.receive(data, self._link_name, source, at)
 

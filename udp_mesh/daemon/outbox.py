@@ -30,6 +30,8 @@ log = logging.getLogger(__name__)
 SUFFIX = ".message"
 LOG_AGAIN_S = 60.0
 """Minimum interval between two log lines about a full disk."""
+REMOVE_AGAIN_S = 5.0
+"""Interval between attempts to remove files that a read-only or broken disk kept: a restart would send them again."""
 _CHECKSUM_BYTES = 8
 
 
@@ -57,6 +59,8 @@ class DirectoryStore:
         self._writes: dict[int, Future[None]] = {}
         # Used by the writer thread only.
         self._unsynced: dict[int, Path] = {}
+        self._unremoved: set[int] = set()
+        self._removal_timer: threading.Timer | None = None
         self._disk = ThreadPoolExecutor(max_workers=1, thread_name_prefix="outbox")
 
     def check_writable(self) -> None:
@@ -114,11 +118,15 @@ class DirectoryStore:
             self._give_up(key, temporary, error)
             return
         self._unsynced[key] = path
+        self._unremoved.discard(key)
 
     def _give_up(self, key: int, path: Path, error: OSError) -> None:
         """The disk failed: the message is in memory only."""
-        with contextlib.suppress(OSError):
+        try:
             path.unlink(missing_ok=True)
+        except OSError:
+            self._unremoved.add(key)
+            self._remove_again_later()
         with self._lock:
             self.bytes -= self._sizes.pop(key, 0)
             self._refuse("outbox-write-failed", f"path={path} error={error}")
@@ -148,11 +156,37 @@ class DirectoryStore:
 
     def _unlink(self, key: int) -> None:
         self._unsynced.pop(key, None)
+        if not self._is_unlinked(key):
+            self._unremoved.add(key)
+            self._remove_again_later()
+
+    def _is_unlinked(self, key: int) -> bool:
         path = self._path(key)
         try:
             path.unlink(missing_ok=True)
+        except NotADirectoryError:
+            return True
         except OSError as error:
             self._log("outbox-remove-failed", f"path={path} error={error}")
+            return False
+        return True
+
+    def _remove_again_later(self) -> None:
+        if self._removal_timer is None:
+            self._removal_timer = threading.Timer(REMOVE_AGAIN_S, self._request_removal)
+            self._removal_timer.daemon = True
+            self._removal_timer.start()
+
+    def _request_removal(self) -> None:
+        # closed meanwhile
+        with contextlib.suppress(RuntimeError):
+            self._disk.submit(self._remove_again)
+
+    def _remove_again(self) -> None:
+        self._removal_timer = None
+        self._unremoved = {key for key in self._unremoved if not self._is_unlinked(key)}
+        if self._unremoved:
+            self._remove_again_later()
 
     def holds(self, key: int) -> bool:
         """Whether it is on disk or queued to be written."""
@@ -209,8 +243,11 @@ class DirectoryStore:
                 self._give_up(key, path, error)
 
     def close(self) -> None:
-        """Waits until everything put is written."""
+        """Waits until everything put is written and everything removed is gone, if the disk permits it."""
+        self._disk.submit(self._remove_again)
         self._disk.shutdown()
+        if self._removal_timer is not None:
+            self._removal_timer.cancel()
 
     def _path(self, key: int) -> Path:
         return self._directory / f"{key:020d}{SUFFIX}"

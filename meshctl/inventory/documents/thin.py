@@ -7,7 +7,7 @@ from typing import Literal, Self
 from pydantic import Field, model_validator
 
 from meshctl.inventory.documents.base import NOT_WRITTEN, Document
-from meshctl.inventory.fields import Name, Real, Text, Whole, expected_error
+from meshctl.inventory.fields import DevicePath, Name, Real, Whole, expected_error
 from meshctl.model import ThinBand, ThinFraming
 from meshctl.model.thin import MAX_MESHTASTIC_FRAME_BYTES
 
@@ -65,5 +65,5 @@ class ThinPortsDocument(Document):
 
     number: Whole = Field(ge=1, le=254)
     """Its number there, different from every other robot's."""
-    ports: dict[Name, Text] = Field(default_factory=dict)
+    ports: dict[Name, DevicePath] = Field(default_factory=dict)
     """Serial port by thin link, such as /dev/serial/by-id/...."""

@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterator
 from ipaddress import IPv4Address, ip_address
 
-from meshctl.diagnostics import Severity
+from meshctl.diagnostics import Position, Severity
 from meshctl.lint.context import LintContext
 from meshctl.lint.grouping import duplicates
 from meshctl.lint.places import first_written
@@ -15,7 +15,7 @@ from meshctl.model import Fleet, Mesh, Node
 from meshctl.model.ip import IpAddress, IpInterface, IpNetwork, host_and_port
 from meshctl.wording import join_limited
 
-# so many nodes of a mesh, and all of them, outside its network: the network is wrong, not each address
+# so many nodes of a mesh, and half of them, outside its network: the network is wrong, not each address
 _WRONG_NETWORK_NODES = 3
 # address of a factory-fresh OpenWrt device
 _FACTORY = IPv4Address("192.168.1.1")
@@ -39,10 +39,22 @@ def meshes_of(fleet: Fleet, node: Node) -> list[Mesh]:
     passing="nodes: {b01: {address: 10.42.0.102}}",
 )
 def address_twice(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    # by place: a range that overlaps another is one mistake
+    at: dict[Position, dict[str, list[tuple[tuple[str, ...], str, IpAddress]]]] = {}
     for address, owners in duplicates(stations(fleet)):
         (_, first), *later = owners
-        for path, _ in later:
-            yield Finding(path, f"{first} has the same address", "a unique address", str(address))
+        for path, name in later:
+            at.setdefault(fleet.where(*path).position, {}).setdefault(first, []).append((path, name, address))
+    for by_first in at.values():
+        if len(by_first) == 1:
+            for first, later_ones in by_first.items():
+                for path, _, address in later_ones:
+                    yield Finding(path, f"{first} has the same address", "a unique address", str(address))
+            continue
+        taken = [one for ones in by_first.values() for one in ones]
+        message = f"{join_limited([name for _, name, _ in taken])} have the addresses of {join_limited(list(by_first))}"
+        found = join_limited([str(address) for _, _, address in taken])
+        yield Finding(taken[0][0], message, "unique addresses", found)
 
 
 def stations(fleet: Fleet) -> Iterator[tuple[IpAddress, tuple[tuple[str, ...], str]]]:
@@ -87,25 +99,47 @@ def networks(fleet: Fleet) -> Iterator[tuple[tuple[str, ...], IpNetwork]]:
     passing="nodes: {b01: {address: 10.42.0.7}}",
 )
 def address_outside(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    outside: dict[str, list[Node]] = {}
-    for node in fleet.managed():
-        meshes = meshes_of(fleet, node)
-        if meshes and not any(node.address.ip in mesh.network for mesh in meshes):
-            outside.setdefault(meshes[0].name, []).append(node)
-    for name, nodes in outside.items():
+    wrong = wrong_networks(fleet)
+    at: dict[Position, list[Node]] = {}
+    for name, nodes in _outside(fleet).items():
         mesh = fleet.meshes[name]
-        if len(nodes) >= _WRONG_NETWORK_NODES and not any(
-            other.address.ip in mesh.network for other in fleet.members(name)
-        ):
+        if name in wrong:
             # one typo in the network, rather than one in each address
             message = f"contains no address of {join_limited([node.name for node in nodes])}"
             expected = f"a network with {nodes[0].address.ip}"
             yield Finding(("meshes", name, "network"), message, expected, str(mesh.network))
             continue
         for node in nodes:
-            networks_of_node = dict.fromkeys(str(mesh.network) for mesh in meshes_of(fleet, node))
-            expected = f"an address in {' or '.join(networks_of_node)}"
-            yield Finding(("nodes", node.name, "address"), "outside its mesh's network", expected, str(node.address.ip))
+            at.setdefault(fleet.where("nodes", node.name, "address").position, []).append(node)
+    for nodes in at.values():
+        networks_of_node = dict.fromkeys(str(mesh.network) for mesh in meshes_of(fleet, nodes[0]))
+        expected = f"an address in {' or '.join(networks_of_node)}"
+        message = "outside its mesh's network"
+        if len(nodes) > 1:
+            # the rule of a range
+            message = f"{join_limited([node.name for node in nodes])} are outside their mesh's network"
+        found = join_limited([str(node.address.ip) for node in nodes])
+        yield Finding(("nodes", nodes[0].name, "address"), message, expected, found)
+
+
+def _outside(fleet: Fleet) -> dict[str, list[Node]]:
+    """The nodes whose address is in none of their meshes' networks, by their first mesh."""
+    outside: dict[str, list[Node]] = {}
+    for node in fleet.managed():
+        meshes = meshes_of(fleet, node)
+        if meshes and not any(node.address.ip in mesh.network for mesh in meshes):
+            outside.setdefault(meshes[0].name, []).append(node)
+    return outside
+
+
+def wrong_networks(fleet: Fleet) -> frozenset[str]:
+    """The meshes whose `network` is the mistake, because half of the nodes or more are outside. Addresses of rules with
+    `network` are in any."""
+    return frozenset(
+        name
+        for name, nodes in _outside(fleet).items()
+        if len(nodes) >= _WRONG_NETWORK_NODES and 2 * len(nodes) >= sum(1 for _ in fleet.members(name))
+    )
 
 
 @fleet_rule(
@@ -153,8 +187,10 @@ def gateway_unreachable(fleet: Fleet, _context: LintContext) -> Iterator[Finding
         own = [address for address in (node.address, node.lan_address) if address is not None]
         is_itself = any(node.gateway == address.ip for address in own)
         if is_itself or not any(node.gateway in address.network for address in own):
+            message = "it is the node's own address" if is_itself else "not reachable from the node"
             expected = f"another station in {' or '.join(str(address.network) for address in own)}"
-            yield Finding(("nodes", node.name, "gateway"), "not reachable from the node", expected, str(node.gateway))
+            hint = "Write `gateway: null` at this node, or in a group of the nodes with an uplink." if is_itself else ""
+            yield Finding(("nodes", node.name, "gateway"), message, expected, str(node.gateway), hint)
 
 
 @fleet_rule(
@@ -189,8 +225,11 @@ def factory_address(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     passing="robots: {husky1: {computer: {address: 10.42.0.120/24}}}",
 )
 def computer_elsewhere(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    wrong = wrong_networks(fleet)
     for robot in fleet.robots.values():
         nodes = [fleet.nodes[name] for name in robot.nodes if name in fleet.nodes]
+        if any(mesh in wrong for node in nodes for mesh in node.meshes):
+            continue  # MC202 reports the network
         around = dict.fromkeys(mesh.network for node in nodes for mesh in meshes_of(fleet, node))
         if robot.lan is not None:
             around = dict.fromkeys((robot.lan,))
@@ -236,6 +275,8 @@ def time_server_unreachable(fleet: Fleet, _context: LintContext) -> Iterator[Fin
 
 
 def _out_of_reach(fleet: Fleet, host: str) -> bool:
+    if wrong_networks(fleet):
+        return False
     versions = {node.gateway.version for node in fleet.managed() if node.gateway is not None}
     address = as_address(host)
     if address is None:
@@ -255,7 +296,8 @@ def is_host(text: str) -> bool:
     """Whether it is an address or can be a host name; MC237 reports what is neither."""
     labels = text.removesuffix(".").split(".")
     is_name = len(text) <= _MAX_HOST_CHARACTERS and all(_LABEL.fullmatch(label) for label in labels)
-    return is_name or as_address(text) is not None
+    # no top-level domain is a number (RFC 3696, 2): 10.42.0 and 10.42.0.300 are mistyped addresses
+    return (is_name and not labels[-1].isdecimal()) or as_address(text) is not None
 
 
 def as_address(host: str) -> IpAddress | None:

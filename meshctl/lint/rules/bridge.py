@@ -77,7 +77,7 @@ _CHECKED = {
 # options that a radio without a mesh needs to serve an access point, because it has no mesh to take them from
 _ACCESS_POINT_OPTIONS = ("channel", "htmode", "disabled")
 # sections that meshctl renders, besides radios
-_RENDERED = re.compile(r"mesh[0-9]+|bat[0-9]+|lan|backbone|loopback|br_lan|main")
+_RENDERED = re.compile(r"mesh[0-9]+|bat[0-9]+|lan|backbone|loopback|br_lan|main|@[a-z-]+\[-?[0-9]+\]")
 _TWO_RADIOS = """
 nodes: {husky1-rear: {role: robot, address: 10.42.0.12, label: H1R}}
 robots: {husky1: {nodes: [husky1-front, husky1-rear]}}
@@ -285,11 +285,11 @@ def extra_checked(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
 
 
 def _is_unchecked(node: Node, package: str, section: str, option: str) -> bool:
-    """Whether the option is one of a section that `extra_uci` creates, or of a radio that is in no mesh."""
+    """Whether the option is one of a section that meshctl does not render, or of a radio that is in no mesh."""
     radio = next((radio for radio in node.radios if package == "wireless" and radio.name == section), None)
     if radio is not None:
         return radio.mesh is None and option in _ACCESS_POINT_OPTIONS
-    return f"{package}.{section}" in node.extra_uci and _RENDERED.fullmatch(section) is None
+    return _RENDERED.fullmatch(section) is None
 
 
 @fleet_rule(

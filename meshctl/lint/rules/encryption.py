@@ -201,7 +201,7 @@ def passphrase_not_allowed(fleet: Fleet, context: LintContext) -> Iterator[Findi
             expected = "8 to 63 printable ASCII characters, or 64 hexadecimal digits"
             yield Finding(path, "invalid passphrase", expected, _length(value))
         elif mesh.encryption is Encryption.SAE and not (1 <= len(value) <= 128 and value.isprintable()):
-            yield Finding(path, "invalid passphrase", "1 to 128 characters on one line", _length(value))
+            yield Finding(path, "invalid passphrase", "1 to 128 characters on one line", _lines(value))
         elif mesh.encryption is Encryption.SAE and len(value.encode()) == 64 and _before_23_05(fleet, mesh):
             message = "up to OpenWrt 22.03, a key of 64 characters joins no SAE mesh"
             found = f"64 characters, and an older release than 23.05 on {join_limited(_before_23_05(fleet, mesh))}"
@@ -209,6 +209,14 @@ def passphrase_not_allowed(fleet: Fleet, context: LintContext) -> Iterator[Findi
         elif "'" in value and any(node.release >= Release.V25_12 for node in fleet.members(mesh.name)):
             # same as for an SSID (MC310)
             yield Finding(path, "breaks on OpenWrt 25.12", "no apostrophe", "one")
+
+
+def _lines(value: str) -> str:
+    """What a passphrase of SAE has too much of; a whole file of secrets has several lines."""
+    count = len(value.splitlines())
+    if count > 1:
+        return f"{_length(value)} on {count} lines"
+    return _length(value) if value.isprintable() else f"{_length(value)}, some not printable"
 
 
 def _before_23_05(fleet: Fleet, mesh: Mesh) -> list[str]:

@@ -158,8 +158,10 @@ def _owner(network: Package, served: Section) -> IPv4Interface | None:
     if interface is None or interface.get("proto") != "static" or not interface.get("ipaddr"):
         return None
     address, netmask = interface.get("ipaddr").split()[0], interface.get("netmask")
+    if "/" not in address and not netmask:
+        return None  # MC924 reports it
     try:
-        owner = ip_interface(address if "/" in address or not netmask else f"{address}/{netmask}")
+        owner = ip_interface(address if "/" in address else f"{address}/{netmask}")
     except ValueError:
         return None
     return owner if isinstance(owner, IPv4Interface) else None

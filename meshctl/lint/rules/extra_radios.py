@@ -1,4 +1,4 @@
-"""Further radios in extra_uci: the channels of access points, and options with a typo (MC919 to MC920)."""
+"""Further radios in extra_uci: the channels of access points; options of all packages with a typo (MC919 to MC920)."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from meshctl.model import Fleet
 from meshctl.regdb import initiating_channels
 from meshctl.suggest import suggestion
 
-# the options of wireless that inventories set; others are compared with these only
+# the options that inventories set, by package and type of the section; others are compared with these only
 _OPTIONS = {
-    "wifi-device": """
+    ("wireless", "wifi-device"): """
         type path phy macaddr band hwmode channel channels htmode country country_ie txpower disabled distance
         beacon_int rts frag diversity rxantenna txantenna antenna_gain noscan ht_coex short_gi_20 short_gi_40 ldpc
         legacy_rates cell_density require_mode basic_rate supported_rates log_level hostapd_options doth chanbw
         acs_exclude_dfs background_radar maxassoc airtime_mode
     """,
-    "wifi-iface": """
+    ("wireless", "wifi-iface"): """
         device network mode ssid bssid encryption key disabled hidden isolate ifname macaddr maclist macfilter wds
         mesh_id mesh_fwding mesh_rssi_threshold mcast_rate wmm short_preamble dtim_period max_inactivity maxassoc
         disassoc_low_ack skip_inactivity_poll ieee80211w ieee80211r ieee80211k ieee80211v mobility_domain
@@ -31,8 +31,34 @@ _OPTIONS = {
         auth_secret acct_server acct_port acct_secret eap_type auth identity password ca_cert client_cert priv_key
         addr vif txpower
     """,
+    ("network", "interface"): """
+        proto device ifname type auto disabled force_link delegate ipaddr netmask gateway broadcast dns dns_search
+        dns_metric metric mtu macaddr ip6addr ip6gw ip6assign ip6hint ip6prefix ip6class ip6ifaceid ip4table ip6table
+        defaultroute peerdns hostname clientid vendorid reqopts sendopts reqaddress reqprefix norelease username
+        password routing_algo gw_mode gw_bandwidth gw_sel_class hop_penalty orig_interval fragmentation
+        aggregated_ogms ap_isolation bonding bridge_loop_avoidance distributed_arp_table isolation_mark log_level
+        multicast_mode multicast_fanout network_coding multicast_forceflood master elp_interval throughput_override
+        hop_penalty private_key listen_port addresses fwmark
+    """,
+    ("firewall", "zone"): """
+        name network device subnet input output forward masq masq6 masq_allow_invalid masq_src masq_dest mtu_fix
+        family log log_limit extra extra_src extra_dest helper auto_helper conntrack enabled
+    """,
+    ("firewall", "forwarding"): "src dest family ipset name enabled",
+    ("firewall", "rule"): """
+        name src dest src_ip src_mac src_port proto icmp_type dest_ip dest_port device direction ipset mark set_mark
+        set_xmark set_dscp dscp start_date stop_date start_time stop_time weekdays monthdays utc_time target family
+        limit limit_burst extra enabled helper set_helper log
+    """,
+    ("dhcp", "dhcp"): """
+        interface start limit leasetime dynamicdhcp force ignore netmask dhcp_option dhcp_option_force dhcpv4 dhcpv6 ra
+        ra_flags ra_slaac ra_default ra_management ra_lifetime ra_maxinterval ra_mininterval ra_mtu ra_dns ndp master
+        dns dns_service domain networkid piofolder prefix_filter instance
+    """,
 }
 _KNOWN = {kind: frozenset(words.split()) for kind, words in _OPTIONS.items()}
+# what other programs call an option
+_SYNONYMS = {("firewall", "zone", "masquerade"): "masq", ("firewall", "zone", "networks"): "network"}
 
 
 @fleet_rule(
@@ -66,7 +92,7 @@ def extra_channel(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     Severity.WARNING,
     "An option of extra_uci is probably misspelled",
     why="""OpenWrt ignores options that it does not know: an access point with a mistyped `device` or `network` is not
-    on the air, or leads nowhere.""",
+    on the air, or leads nowhere, and a gateway with a mistyped `gw_mode` or `masq` serves no client.""",
     fix="Correct the name of the option; suppress this finding if a package of the image reads it.",
     failing="""
     nodes: {b01: {extra_uci: {wireless.guest: wifi-iface, wireless.guest.device: radio0, wireless.guest.mode: ap,
@@ -82,8 +108,20 @@ def extra_channel(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
 def option_misspelled(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     for node, packages in with_extra(fleet, context):
         for key, _, package, section, option in extra_entries(node, packages):
-            known = _KNOWN.get(section.type) if section is not None and package == "wireless" else None
-            if not known or not option or option in known or not (near := one_edit_apart(option, known)):
+            kind = (package, section.type) if section is not None else ("", "")
+            known = _KNOWN.get(kind, frozenset())
+            if not known or not option or option in known or not (near := _meant(kind, option, known)):
                 continue
             path = ("nodes", node.name, "extra_uci", key)
             yield Finding(path, "OpenWrt does not read this option", " or ".join(near), option, suggestion(near))
+
+
+def _meant(kind: tuple[str, str], option: str, known: frozenset[str]) -> tuple[str, ...]:
+    """The options that a name with a typo, its first half, or another program's word probably means."""
+    synonym = _SYNONYMS.get((*kind, option))
+    cut = [word for word in known if word.startswith(option) and 2 * len(option) >= len(word) and kind != _INTERFACE]
+    return (synonym,) if synonym else one_edit_apart(option, known) or (tuple(cut) if len(cut) == 1 else ())
+
+
+# the one type whose options depend on `proto`, and come from many packages
+_INTERFACE = ("network", "interface")

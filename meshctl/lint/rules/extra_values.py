@@ -18,6 +18,7 @@ from meshctl.suggest import did_you_mean, suggestion
 _Check = Callable[[str], tuple[str, str] | None]
 
 _MAX_SSID_BYTES = 32
+_MAX_VLAN = 4094
 _UNIQUE_LOCAL = IPv6Network("fc00::/7")
 # OpenWrt's wifi scripts look for these in the value
 _METHODS = ("psk", "sae", "owe", "wpa", "wep", "8021x")
@@ -98,6 +99,12 @@ def _netmask(value: str) -> tuple[str, str] | None:
     return None
 
 
+def _vlan_device(value: str) -> tuple[str, str] | None:
+    name, _, vlan = value.rpartition(".")
+    is_valid = not name or not vlan.isdecimal() or 1 <= int(vlan) <= _MAX_VLAN
+    return None if is_valid else (f"a VLAN from 1 to {_MAX_VLAN} behind the port", "")
+
+
 _MAC = re.compile(r"[0-9a-f]{2}(:[0-9a-f]{2}){5}", re.IGNORECASE)
 _LEASE_TIME = re.compile(r"\d+[smhdw]?|infinite", re.ASCII)
 # netifd drops a value that is none of these, and the option has its default (libuci, blob.c)
@@ -134,6 +141,7 @@ _CHECKS: dict[tuple[str, str, str], _Check] = {
     ("dhcp", "dhcp", "limit"): _number(1, 2**24),
     ("dhcp", "dhcp", "leasetime"): _lease_time,
     ("network", "interface", "proto"): _not_misspelled("static", "dhcp", "dhcpv6", "none", "pppoe", "wireguard"),
+    ("network", "interface", "device"): _vlan_device,
     ("network", "interface", "ipaddr"): _addresses,
     ("network", "interface", "ip6addr"): _addresses,
     ("network", "interface", "netmask"): _netmask,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 
 from meshctl.device.trust import Pin, parse_pins
 from meshctl.diagnostics import Severity
@@ -202,7 +203,8 @@ def _host_keys(fleet: Fleet, context: LintContext) -> Iterator[tuple[str, str]]:
 def label_twice(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     # a person, and a table's row, do not tell b1 from B1
     marks = ((node.label.casefold(), ("nodes", node.name, "label")) for node in fleet.managed() if node.label)
-    yield from _collisions(fleet, marks, "label")
+    for finding in _collisions(fleet, marks, "label"):
+        yield replace(finding, found=fleet.nodes[finding.path[1]].label)
 
 
 @fleet_rule(

@@ -135,7 +135,9 @@ def prefix_differs(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for robot in fleet.robots.values():
         around = [("the robot's LAN", "the LAN's", robot.lan)] if robot.lan is not None else []
         if not around:
-            around = [(f"mesh {mesh.name}", "the mesh's", mesh.network) for mesh in fleet.meshes.values()]
+            # meshes may share a network
+            first_of = {mesh.network: mesh.name for mesh in reversed(tuple(fleet.meshes.values()))}
+            around = [(f"mesh {name}", "the mesh's", network) for network, name in first_of.items()]
         for place, _, computer in robot.all_computers():
             address = computer.address
             for where, whose, network in around:

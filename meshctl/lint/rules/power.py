@@ -1,4 +1,4 @@
-"""Transmit power: hardware limits, regulatory limits, asymmetric links (MC341 to MC350)."""
+"""Transmit power: hardware limits, regulatory limits, asymmetric links (MC341 to MC351)."""
 
 from __future__ import annotations
 
@@ -25,6 +25,8 @@ _ASYMMETRY_DB = 10.0
 _CLASS_TOLERANCE_DB = 3.0
 # 40 dBm is 10 W, more than any robot radio; 500 or 1000 are milliwatts
 _MAX_RATED_DBM = 40.0
+# 5 dBm is 3 mW, less than any radio of a mesh is meant to transmit; 1 or 2 are watts
+_MIN_PLAUSIBLE_DBM = 5.0
 
 
 def _dbm(value: float) -> str:
@@ -298,3 +300,25 @@ def radio_path_twice(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
             if first != radio.name:
                 path = ("hardware", profile.name, "radios", radio.name, "path")
                 yield Finding(path, f"{first} has the same path", "a unique path", radio.path)
+
+
+@fleet_rule(
+    "MC351",
+    Severity.WARNING,
+    "A power looks like watts",
+    why="""Powers are in dBm: 1 W is 30, 2 W is 33. A radio at 2 dBm transmits less than 2 mW, and reaches a twentieth
+    of the distance.""",
+    fix="Write dBm: 10 * log10(mW). 2 W is 33 dBm.",
+    failing="defaults: {radios: {radio0: {tx_power_dbm: 2}}}",
+    passing="defaults: {radios: {radio0: {tx_power_dbm: 24}}}",
+)
+def power_in_watts(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for profile in fleet.hardware.values():
+        for built_in in profile.radios:
+            if built_in.rated_power_dbm < _MIN_PLAUSIBLE_DBM:
+                rating = ("hardware", profile.name, "radios", built_in.name, "rated_power_dbm")
+                yield Finding(rating, "not a plausible power in dBm", "at least 5", _dbm(built_in.rated_power_dbm))
+    for node, radio, _ in _transmitting(fleet):
+        if radio.tx_power_dbm < _MIN_PLAUSIBLE_DBM:
+            path = _drive_path(fleet, node, radio)
+            yield Finding(path, "not a plausible power in dBm", "at least 5", str(radio.tx_power_dbm))

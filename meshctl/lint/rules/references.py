@@ -8,7 +8,7 @@ from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
 from meshctl.lint.grouping import group_by_key
 from meshctl.lint.rule import Finding, fleet_rule
-from meshctl.model import Fleet, Role
+from meshctl.model import Fleet, Node, Role
 from meshctl.suggest import did_you_mean
 from meshctl.wording import join_limited
 
@@ -29,8 +29,24 @@ def _unknown(fleet: Fleet, path: tuple[str, ...], names: Sequence[str]) -> Itera
     unknown = dict.fromkeys(name for name in names if name not in fleet.nodes)
     for wrong in group_by_key((fleet.where(*path, name).position, name) for name in unknown).values():
         _, hint = suggest(fleet.nodes, wrong[0])
+        members = [node.name for node in fleet.nodes.values() if wrong[0] in node.groups]
+        if members:
+            hint = f"a group: list its nodes ({join_limited(members)}), or a range of them"
+        elif "*" in wrong[0]:
+            hint = 'patterns are for commands: list the nodes, or a range such as "b[01-03]"'
         message = "no such node" if len(wrong) == 1 else "no such nodes"
         yield Finding((*path, wrong[0]), message, "names of `nodes`", join_limited(wrong), hint)
+
+
+def unmeshed(fleet: Fleet, node: Node) -> str:
+    """Why a node without a mesh is in none: the bands of its radios and of the meshes, if they differ."""
+    bands = {mesh.band for mesh in fleet.meshes.values()}
+    if not node.radios or any(radio.hardware.band in bands for radio in node.radios):
+        return "none"
+    radios = ", ".join(f"{radio.name} is {radio.hardware.band.value}" for radio in node.radios)
+    return (
+        f"none: {radios}, and {', '.join(f'mesh {mesh.name} is {mesh.band.value}' for mesh in fleet.meshes.values())}"
+    )
 
 
 @fleet_rule(
@@ -98,8 +114,8 @@ def unknown_carried_node(fleet: Fleet, _context: LintContext) -> Iterator[Findin
 @fleet_rule(
     "MC105",
     Severity.ERROR,
-    "A node's jump host does not exist",
-    why="Every command for this node fails before it connects.",
+    "A jump host does not exist",
+    why="Every command for this node or computer fails before it connects.",
     fix="Name a node in `ssh.jump`, or remove it to connect directly.",
     failing="nodes: {b01: {ssh: {jump: bsae}}}",
     passing="nodes: {b01: {ssh: {jump: base}}}",
@@ -110,6 +126,12 @@ def unknown_jump(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
             _, hint = suggest(fleet.nodes, node.ssh.jump)
             path = ("nodes", node.name, "ssh", "jump")
             yield Finding(path, "no such node", "a name of `nodes`", node.ssh.jump, hint)
+    for robot in fleet.robots.values():
+        for key, _, computer in robot.all_computers():
+            if computer.ssh.jump and computer.ssh.jump not in fleet.nodes:
+                _, hint = suggest(fleet.nodes, computer.ssh.jump)
+                place = ("robots", robot.name, *key, "ssh", "jump")
+                yield Finding(place, "no such node", "a name of `nodes`", computer.ssh.jump, hint)
 
 
 @fleet_rule(
@@ -178,7 +200,7 @@ def empty_mesh(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
 def node_without_mesh(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for node in fleet.managed():
         if not node.meshes and node.role is not Role.BASE:
-            yield Finding(("nodes", node.name), "no radio joins a mesh", "at least one", "none")
+            yield Finding(("nodes", node.name), "no radio joins a mesh", "at least one", unmeshed(fleet, node))
 
 
 @fleet_rule(

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from meshctl.diagnostics import Severity
+from meshctl.diagnostics import Position, Severity
 from meshctl.lint.context import LintContext
 from meshctl.lint.grouping import duplicates, group_by_key
 from meshctl.lint.places import first_written
 from meshctl.lint.rule import Finding, fleet_rule
+from meshctl.lint.rules.references import unmeshed
 from meshctl.lint.rules.relays import behind_further_links
 from meshctl.model import Fleet, NodeState, Role
 from meshctl.wording import counted, join_limited
@@ -153,10 +154,14 @@ def node_of_two_robots(fleet: Fleet, _context: LintContext) -> Iterator[Finding]
         for key, names in (("nodes", robot.nodes), ("carries", robot.carries))
         for name in names
     )
+    claimed: dict[tuple[str, str, str, Position], list[str]] = {}
     for (key, name), (first, *others) in duplicates(claims):
         for robot in others:
-            message = f"{name} is already claimed by {first}"
-            yield Finding(("robots", robot, key, name), message, "one robot per node", name)
+            claimed.setdefault((first, robot, key, fleet.where("robots", robot, key, name).position), []).append(name)
+    for (first, robot, key, _), names in claimed.items():
+        # one finding for a range
+        message = f"{join_limited(names)} {'is' if len(names) == 1 else 'are'} already claimed by {first}"
+        yield Finding(("robots", robot, key, names[0]), message, "one robot per node", join_limited(names))
     for robot_name, name in _own_nodes_carried(fleet):
         message = f"{name} is mounted on {robot_name} itself"
         yield Finding(("robots", robot_name, "carries", name), message, "either `nodes` or `carries`", name)
@@ -275,7 +280,7 @@ def robot_without_radio(fleet: Fleet, _context: LintContext) -> Iterator[Finding
     loops, and plans cannot determine what a change disconnects. A radio that a robot has under `nodes`, but with the
     role of a beacon (the default), is counted and marked as one. Hops are counted, and plans start, from a base.""",
     fix="List a robot's radio under its `nodes`, with `role: robot`; list beacons under `carries`.",
-    failing="nodes: {stray: {role: robot, address: 10.42.0.77}}",
+    failing="nodes: {stray: {role: robot, state: carried, address: 10.42.0.77}}",
     passing="""
     nodes: {stray: {role: robot, address: 10.42.0.77}}
     robots: {husky1: {nodes: [husky1-front, stray]}}
@@ -285,7 +290,8 @@ def role_without_robot(fleet: Fleet, _context: LintContext) -> Iterator[Finding]
     mounted_on = {name: robot.name for robot in fleet.robots.values() for name in robot.nodes}
     stations = [robot.name for robot in fleet.robots.values() if robot.is_base]
     for node in fleet.managed():
-        if node.role is Role.ROBOT and not node.robot and fleet.robots:
+        # a spare waits for the robot whose radio fails
+        if node.role is Role.ROBOT and not node.robot and fleet.robots and node.state is not NodeState.SPARE:
             yield Finding(("nodes", node.name), "belongs to no robot", "a robot that lists it", "none")
         elif node.role is Role.BEACON and node.name in mounted_on:
             path = first_written(fleet, ("nodes", node.name, "role"), ("nodes", node.name))
@@ -383,4 +389,4 @@ def no_base_station(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
 def base_without_mesh(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for node in fleet.managed():
         if node.role is Role.BASE and not node.meshes:
-            yield Finding(("nodes", node.name), "no radio joins a mesh", "at least one", "none")
+            yield Finding(("nodes", node.name), "no radio joins a mesh", "at least one", unmeshed(fleet, node))

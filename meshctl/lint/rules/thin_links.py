@@ -1,4 +1,4 @@
-"""Thin links: numbers, ports, the limits of their bands, and what topics offer on them (MC771 to MC779)."""
+"""Thin links: numbers, ports, the limits of their bands, and what topics offer on them (MC771 to MC781)."""
 
 from __future__ import annotations
 
@@ -7,11 +7,26 @@ from collections.abc import Iterator
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
 from meshctl.lint.grouping import duplicates
+from meshctl.lint.places import first_written
 from meshctl.lint.rule import Example, Finding, fleet_rule
 from meshctl.lint.rules.references import suggest
 from meshctl.model import Fleet, ThinBand, ThinLink, Topic
 from meshctl.model.thin import BURST_SHARE, MAX_2400_MHZ_FRAME_BYTES, PART_OVERHEAD_BYTES
 from meshctl.render.thin import frame_problems
+from meshctl.wording import join_limited
+
+
+def _countries(text: str) -> frozenset[str]:
+    return frozenset(text.split())
+
+
+# Countries where a band is not free for such radios: America and Oceania have no 868 MHz band, CEPT (ERC/REC 70-03) has
+# no 915 MHz band of this kind.
+_AMERICA = _countries("AR AU BO BR CA CL CO CR EC GT MX NZ PA PE PR PY US UY VE")
+_CEPT = _countries(
+    "AT BE BG CH CY CZ DE DK EE ES FI FR GB GR HR HU IE IS IT LI LT LU LV MC MT NL NO PL PT RO SE SI SK TR UA"
+)
+_NOT_IN = {ThinBand.EU868: _AMERICA, ThinBand.EU869: _AMERICA, ThinBand.US915: _CEPT}
 
 # Of a presence with some heard nodes; an acknowledgment in a frame of its own.
 _PRESENCE_BYTES = 60
@@ -47,11 +62,11 @@ def number_used_twice(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     that should arrive where Wi-Fi does not reach are lost.""",
     fix="Use a link of `udp_mesh.thin_links`.",
     failing="""
-    udp_mesh: {thin_links: {lora: {bits_per_s: 5470, band: eu869}}}
+    udp_mesh: {thin_links: {lora: {bits_per_s: 5470, band: us915}}}
     robots: {husky1: {thin: {number: 2, ports: {lroa: /dev/ttyUSB0}}}}
     """,
     passing="""
-    udp_mesh: {thin_links: {lora: {bits_per_s: 5470, band: eu869}}}
+    udp_mesh: {thin_links: {lora: {bits_per_s: 5470, band: us915}}}
     robots:
       base-station: {thin: {number: 1, ports: {lora: /dev/ttyUSB0}}}
       husky1: {thin: {number: 2, ports: {lora: /dev/ttyUSB0}}}
@@ -59,6 +74,13 @@ def number_used_twice(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
 )
 def unknown_thin_link(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     known = tuple(fleet.udp_mesh.thin_links)
+    owners = [robot.name for robot in fleet.robots.values() if robot.thin is not None and robot.thin.ports]
+    if not known and len(owners) > 1:
+        # the section is missing, rather than each port wrong
+        path = first_written(fleet, ("udp_mesh",), ("robots", owners[0], "thin", "ports"))
+        found = f"ports of {join_limited(owners)}"
+        yield Finding(path, "no thin link is defined", "udp_mesh.thin_links", found)
+        return
     for robot in fleet.robots.values():
         for name in robot.thin.ports if robot.thin is not None else ():
             if name not in known:
@@ -79,8 +101,12 @@ def unknown_thin_link(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     why="""The daemons send up to `duty_cycle` of every hour. EN 300 220-2 allows 1 % from 868.0 to 868.6 MHz and 10 %
     from 869.4 to 869.65 MHz, without listening before talking.""",
     fix="Remove `duty_cycle`, which defaults to the band's, or use a band that allows more.",
-    failing="udp_mesh: {thin_links: {lora: {bits_per_s: 5470, band: eu868, duty_cycle: 0.1}}}",
-    passing="udp_mesh: {thin_links: {lora: {bits_per_s: 5470, band: eu869, duty_cycle: 0.1}}}",
+    failing=Example(
+        "udp_mesh: {thin_links: {lora: {bits_per_s: 5470, band: eu868, duty_cycle: 0.1}}}", also=("MC781",)
+    ),
+    passing=Example(
+        "udp_mesh: {thin_links: {lora: {bits_per_s: 5470, band: eu869, duty_cycle: 0.1}}}", also=("MC781",)
+    ),
 )
 def duty_cycle_of_band(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for name, link in fleet.udp_mesh.thin_links.items():
@@ -114,14 +140,20 @@ def frame_beyond_band(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     need more airtime than the duty cycle allows in the long run. Less urgent messages then wait until they expire, and
     the link has nothing left when it is needed.""",
     fix="Mark fewer topics with `thin`, set `thin_period_s`, send smaller messages, or use a faster radio.",
-    failing="""
+    failing=Example(
+        """
     udp_mesh: {thin_links: {lora: {bits_per_s: 5470, band: eu868}}}
     topics: {pose: {priority: 8, rate_hz: 10, size_bytes: 60, thin: true}}
     """,
-    passing="""
+        also=("MC781",),
+    ),
+    passing=Example(
+        """
     udp_mesh: {thin_links: {lora: {bits_per_s: 5470, band: eu868}}}
     topics: {pose: {priority: 8, rate_hz: 10, size_bytes: 60, thin: true, thin_period_s: 60}}
     """,
+        also=("MC781",),
+    ),
 )
 def thin_overload(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for name, link in fleet.udp_mesh.thin_links.items():
@@ -165,11 +197,11 @@ def _airtime_share(topic: Topic, link: ThinLink) -> float:
     option.""",
     fix="Send a smaller message (an artifact without its image), remove the option, or remove `thin`.",
     failing="""
-    udp_mesh: {thin_links: {lora: {bits_per_s: 5470, band: eu869, frame_bytes: 64}}}
+    udp_mesh: {thin_links: {lora: {bits_per_s: 5470, band: us915, frame_bytes: 64}}}
     topics: {report: {priority: 4, size_bytes: 20000, thin: true}}
     """,
     passing="""
-    udp_mesh: {thin_links: {lora: {bits_per_s: 5470, band: eu869, frame_bytes: 64}}}
+    udp_mesh: {thin_links: {lora: {bits_per_s: 5470, band: us915, frame_bytes: 64}}}
     topics: {report: {priority: 4, size_bytes: 200, thin: true}}
     """,
 )
@@ -219,11 +251,11 @@ def frame_beyond_xbee(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     Usually the base station's radio is missing in the inventory.""",
     fix="Add the port of another robot's radio (`thin.ports`), such as the base station's, or remove this one.",
     failing="""
-    udp_mesh: {thin_links: {lora: {bits_per_s: 5470, band: eu869}}}
+    udp_mesh: {thin_links: {lora: {bits_per_s: 5470, band: us915}}}
     robots: {husky1: {thin: {number: 2, ports: {lora: /dev/ttyUSB0}}}}
     """,
     passing="""
-    udp_mesh: {thin_links: {lora: {bits_per_s: 5470, band: eu869}}}
+    udp_mesh: {thin_links: {lora: {bits_per_s: 5470, band: us915}}}
     robots:
       base-station: {thin: {number: 1, ports: {lora: /dev/ttyUSB0}}}
       husky1: {thin: {number: 2, ports: {lora: /dev/ttyUSB0}}}
@@ -249,14 +281,14 @@ def robot_alone_on_thin_link(fleet: Fleet, _context: LintContext) -> Iterator[Fi
     fix="Give each link the port of its own radio, best by its name in /dev/serial/by-id.",
     failing=Example(
         """
-        udp_mesh: {thin_links: {lora: {bits_per_s: 5470, band: eu869}, far: {bits_per_s: 5470, band: eu869}}}
+        udp_mesh: {thin_links: {lora: {bits_per_s: 5470, band: us915}, far: {bits_per_s: 5470, band: us915}}}
         robots:
           base-station: {thin: {number: 1, ports: {lora: /dev/ttyUSB0, far: /dev/ttyUSB0}}}
           husky1: {thin: {number: 2, ports: {lora: /dev/ttyUSB0, far: /dev/ttyUSB1}}}
         """
     ),
     passing="""
-    udp_mesh: {thin_links: {lora: {bits_per_s: 5470, band: eu869}, far: {bits_per_s: 5470, band: eu869}}}
+    udp_mesh: {thin_links: {lora: {bits_per_s: 5470, band: us915}, far: {bits_per_s: 5470, band: us915}}}
     robots:
       base-station: {thin: {number: 1, ports: {lora: /dev/ttyUSB0, far: /dev/ttyUSB1}}}
       husky1: {thin: {number: 2, ports: {lora: /dev/ttyUSB0, far: /dev/ttyUSB1}}}
@@ -269,3 +301,56 @@ def serial_port_twice(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
             for link in later:
                 path = ("robots", robot.name, "thin", "ports", link)
                 yield Finding(path, f"{first} has the same port", "a port of its own", port)
+
+
+@fleet_rule(
+    "MC780",
+    Severity.ERROR,
+    "A robot's name does not fit the frames of its thin link",
+    why="""A robot introduces itself on a thin link with its name in one frame. The daemon refuses a name that does not
+    fit, and does not start.""",
+    fix="Choose a shorter name, larger frames (`frame_bytes`), or a faster air rate where a band limits them.",
+    failing="""
+    udp_mesh: {thin_links: {lora: {bits_per_s: 5470, band: us915, frame_bytes: 40}}}
+    nodes: {rescue: {role: robot, state: carried, address: 10.42.0.12, label: R1}}
+    robots:
+      base-station: {thin: {number: 1, ports: {lora: /dev/ttyUSB0}}}
+      search-and-rescue: {nodes: [rescue], thin: {number: 2, ports: {lora: /dev/ttyUSB0}}}
+    """,
+    passing="""
+    udp_mesh: {thin_links: {lora: {bits_per_s: 5470, band: us915, frame_bytes: 60}}}
+    nodes: {rescue: {role: robot, state: carried, address: 10.42.0.12, label: R1}}
+    robots:
+      base-station: {thin: {number: 1, ports: {lora: /dev/ttyUSB0}}}
+      search-and-rescue: {nodes: [rescue], thin: {number: 2, ports: {lora: /dev/ttyUSB0}}}
+    """,
+)
+def name_beyond_frame(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    links = fleet.udp_mesh.thin_links
+    for robot in fleet.robots.values():
+        ports = robot.thin.ports if robot.thin is not None else ()
+        for name in ports:
+            if name not in links or any(frame_problems(links[name])):
+                continue
+            length, limit = len(robot.name.encode()), links[name].longest_name_bytes
+            if length > limit:
+                text = f"frames of {name} have {links[name].largest_frame_bytes} bytes"
+                yield Finding(("robots", robot.name), text, f"a name of at most {limit} bytes", f"{length} bytes")
+
+
+@fleet_rule(
+    "MC781",
+    Severity.WARNING,
+    "A thin link's band is not free in the country",
+    why="""The radios transmit where the band belongs to others: 868 MHz is for unlicensed radios in Europe, 902 to
+    928 MHz in America and Oceania. The limits that the daemon keeps are then the wrong ones.""",
+    fix="Set `band` to that of the radios in your country: eu868 or eu869 in Europe, us915 in America.",
+    failing="udp_mesh: {thin_links: {lora: {bits_per_s: 5470, band: eu868}}}",
+    passing="udp_mesh: {thin_links: {lora: {bits_per_s: 5470, band: us915}}}",
+)
+def band_of_another_region(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for name, link in fleet.udp_mesh.thin_links.items():
+        if fleet.country in _NOT_IN.get(link.band, ()):
+            path = ("udp_mesh", "thin_links", name, "band")
+            others = [band.value for band, countries in _NOT_IN.items() if fleet.country not in countries]
+            yield Finding(path, f"not for radios in {fleet.country}", " or ".join(others), link.band.value)

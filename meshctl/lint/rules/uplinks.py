@@ -29,12 +29,18 @@ from meshctl.model.ip import IpAddress
 def gateway_without_uplink(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     if has_own_templates(fleet):
         return
-    radios: dict[IpAddress, Node] = {node.address.ip: node for node in fleet.managed()}
+    radios: dict[IpAddress, Node] = {node.address.ip: node for node in fleet.nodes.values()}
     for node in fleet.managed():
         router = radios.get(node.gateway) if node.gateway is not None else None
-        if router is None or router is node or _has_uplink(fleet, router):
+        if router is None or router is node:
             continue
         path = ("nodes", node.name, "gateway")
+        if not router.state.is_managed:
+            message, expected = f"{router.name} is {router.state.value}", "a router, or a radio in use with an uplink"
+            yield Finding(path, message, expected, str(node.gateway))
+            continue
+        if _has_uplink(fleet, router):
+            continue
         yield Finding(path, f"{router.name} has no uplink", "a router, or a radio with an uplink", str(node.gateway))
 
 

@@ -12,9 +12,10 @@ from meshctl.report.findings.plain import summary
 FORMATS = {"text": "plain", "json": "machine", "sarif": "sarif", "junit": "junit", "github": "annotations"}
 
 
-def formatted(findings: Findings, name: str) -> str:
-    """The findings in one of `FORMATS`."""
-    text: str = getattr(import_module(f"meshctl.report.findings.{FORMATS[name]}"), name)(findings)
+def formatted(findings: Findings, name: str, width: int | None = None) -> str:
+    """The findings in one of `FORMATS`; `text` is wrapped at `width`."""
+    write = getattr(import_module(f"meshctl.report.findings.{FORMATS[name]}"), name)
+    text: str = write(findings, width) if name == "text" else write(findings)
     return text
 
 

@@ -7,18 +7,20 @@ from collections.abc import Iterator, Mapping
 from meshctl.diagnostics import Diagnostic, Severity
 from meshctl.inventory.redaction import Excerpts
 from meshctl.report.findings.document import Findings, printable, shown_line
+from meshctl.report.line_wrap import wrap
 from meshctl.wording import counted
 
 
-def text(findings: Findings) -> str:
-    """Plain text without colors, one block for each finding; ends with a line end."""
+def text(findings: Findings, width: int | None = None) -> str:
+    """Plain text without colors, one block for each finding; ends with a line end. Sentences are wrapped at `width`,
+    the inventory's lines are not."""
     lines = findings.excerpts()
-    blocks = ["\n".join(_block(item, lines)) for item in findings.diagnostics]
+    blocks = ["\n".join(_block(item, lines, width)) for item in findings.diagnostics]
     return "\n".join([*blocks, summary(findings)]) + "\n"
 
 
-def _block(item: Diagnostic, lines: Mapping[str, Excerpts]) -> Iterator[str]:
-    yield f"{item.position}: {item.severity.value}: {printable(item.text)} [{item.code}]"
+def _block(item: Diagnostic, lines: Mapping[str, Excerpts], width: int | None) -> Iterator[str]:
+    yield from wrap(f"{item.position}: {item.severity.value}: {printable(item.text)} [{item.code}]", width)
     found = shown_line(lines, item.position)
     if found is not None and found[0]:
         line, column = found
@@ -29,7 +31,7 @@ def _block(item: Diagnostic, lines: Mapping[str, Excerpts]) -> Iterator[str]:
             before = "".join("\t" if letter == "\t" else " " for letter in line[: column - 1])
             yield f"  {' ' * len(number)} | {before}^"
     if item.hint:
-        yield f"  = {printable(item.hint)}"
+        yield from wrap(f"  = {printable(item.hint)}", width)
 
 
 def summary(findings: Findings) -> str:

@@ -58,7 +58,6 @@ FLUSHED = ["base removed a stale entry of its radio"]
 
 @pytest.mark.lab
 @pytest.mark.xdist_group("stations")
-@pytest.mark.timeout(600)
 class TestOnAVirtualFleet:
     """The same over real SSH; each test leaves the fleet on the rig's current inventory."""
 

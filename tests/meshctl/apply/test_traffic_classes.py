@@ -14,7 +14,7 @@ import pytest
 from meshctl.model import Release
 from tests.meshctl.proof.rig import Rig
 
-pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("logins"), pytest.mark.timeout(900)]
+pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("logins")]
 
 
 @pytest.fixture(params=["logins", "ordinary"])

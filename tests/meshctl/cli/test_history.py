@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from meshctl.cli.journaled_run import retry_command
+from meshctl.cli.journaled_run import retry_hint
 from meshctl.cli.main import main
 from meshctl.errors import InputError
 from meshctl.fleet import Outcome, Result
@@ -109,10 +109,10 @@ def test_a_pattern_selects_the_runs_of_its_nodes(capfd: pytest.CaptureFixture[st
 
 
 def test_the_command_for_what_a_run_left_is_one_that_takes_the_run_up() -> None:
-    assert retry_command("provision") == "meshctl resume"
+    assert retry_hint("provision") == "run `meshctl resume`"
     # `meshctl resume` refuses these
-    assert retry_command("rollback", undoes=4) == "meshctl rollback 4"
-    assert retry_command("restore") == "meshctl restore"
+    assert retry_hint("rollback", undoes=4) == "run `meshctl rollback 4`"
+    assert retry_hint("restore") == "repeat the same `meshctl restore`"
 
 
 @pytest.mark.usefixtures("journal")

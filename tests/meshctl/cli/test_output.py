@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import resource
 import subprocess
@@ -14,7 +15,7 @@ import pytest
 import typer
 
 from meshctl.cli.main import _guarded
-from meshctl.cli.output import echo, write_file
+from meshctl.cli.output import echo, echo_error, write_file
 from meshctl.errors import InputError
 
 
@@ -102,3 +103,21 @@ def test_an_option_yes_makes_a_command_outlive_its_reader(monkeypatch: pytest.Mo
     with pytest.raises(typer.Exit):
         guarded(yes=False)
     assert calls == [True]
+
+
+class _Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def test_a_message_is_wrapped_on_a_terminal_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    text = "error: crane02 still answers at 10.60.0.12: two nodes must not have the same address\nhint: turn it off"
+    monkeypatch.setenv("COLUMNS", "40")
+    shown = []
+    for stream in (_Terminal(), io.StringIO()):
+        monkeypatch.setattr(sys, "stderr", stream)
+        echo_error(text)
+        shown.append(stream.getvalue())
+    assert max(map(len, shown[0].splitlines())) <= 40
+    assert " ".join(shown[0].split()) == " ".join(text.split())
+    assert shown[1] == f"{text}\n"

@@ -52,7 +52,7 @@ def test_a_line_of_many_nodes_fits_into_the_terminal(monkeypatch: pytest.MonkeyP
         for number in range(6):
             line(started(f"b{number:02}"))
         assert line.text() == "queried 0 nodes; waiting for b00, b01, b02, b03 and 2 more"
-        assert screen.getvalue().split("\r\x1b[K")[-1] == "queried 0 nodes; waiting for "
+        assert screen.getvalue().split("\r\x1b[K")[-1] == "queried 0 nodes; waiting ..."
 
 
 def test_without_a_terminal_only_steps_that_take_minutes_are_printed(

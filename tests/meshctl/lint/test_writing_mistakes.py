@@ -78,7 +78,8 @@ def test_a_key_of_extra_uci_is_what_is_to_be_corrected_and_not_a_template(tmp_pa
     """The finding said "Fix the template", of an inventory without one."""
     fragment = "nodes:\n  b01:\n    extra_uci:\n      wireless.guest.device: radio0\n"
     (finding,) = _found(fragment, tmp_path)
-    assert (finding.code, finding.hint.partition(":")[0]) == ("MC901", "correct this key of extra_uci")
+    expected = "create the section with a key of its own, `wireless.guest: TYPE`, or correct the name"
+    assert (finding.code, finding.hint) == ("MC901", expected)
     lines = (tmp_path / "fleet.yaml").read_text(encoding="utf-8").splitlines()
     assert "wireless.guest.device" in lines[finding.position.line - 1]
 

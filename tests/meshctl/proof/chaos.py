@@ -21,13 +21,15 @@ from functools import partial
 from pathlib import Path
 
 from meshctl.apply.backup import read_backup
+from meshctl.apply.mesh_commit import ARM_S
 from meshctl.device.parse.deadman import parse_status
 from tests.meshctl.proof.rig import QUORUM, SPLIT_CHANNELS, VARIANTS, Ended, Rig
 
 # What may strike a node at any moment of a round.
 FAULTS = ("power-cut", "power-cut-torn", "sever", "full-flash", "full-memory", "slow")
 UNDER_WAY = ("armed", "waiting", "applied", "orphaned", "restoring")
-# After an operator is killed: its lock, the grace of the switch's own timers, a reload.
+# After an operator is killed: its lock, the grace of the switch's own timers, a reload. In a change of the whole mesh
+# the lock lasts longer by ARM_S for each batch of nodes.
 REST_SLACK_S = 120.0
 # A timer looks every few seconds whether its change has ended.
 TIMER_TURN_S = 20.0
@@ -226,9 +228,11 @@ def state_in(rig: Rig, file: Path) -> str:
 def at_rest(rig: Rig, names: Iterable[str]) -> dict[str, str]:
     """Node -> the state of its switch once no change or rollback is under way on any; those still under way after the
     longest that lock, window and timers may take."""
-    limit_s = time.monotonic() + rig.window_s * 2 + REST_SLACK_S
+    nodes = list(names)
+    batches = math.ceil(len(nodes) / (rig.parallel or 1))
+    limit_s = time.monotonic() + rig.window_s * 2 + REST_SLACK_S + batches * ARM_S
     while True:
-        states = {name: _state(rig, name) for name in names}
+        states = {name: _state(rig, name) for name in nodes}
         if not set(states.values()) & set(UNDER_WAY) or time.monotonic() > limit_s:
             return states
         time.sleep(1.0)

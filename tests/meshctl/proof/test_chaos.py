@@ -104,7 +104,6 @@ def test_uploads_timers_and_backups_count_as_left_behind() -> None:
 
 @pytest.mark.lab
 @pytest.mark.xdist_group("fleet")
-@pytest.mark.timeout(600)
 def test_a_sample_round_ends_in_a_state_that_the_model_allows(rig: Rig) -> None:
     names = ("base", *rig.names)
     (round_,) = rounds_of(SAMPLE_SEED, rig.names, 1)

@@ -12,7 +12,7 @@ import pytest
 
 from tests.meshctl.proof.rig import Ended, Rig, run
 
-pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("fleet"), pytest.mark.timeout(600)]
+pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("fleet")]
 
 
 def test_an_up_to_date_fleet_needs_no_changes(rig: Rig) -> None:

@@ -9,7 +9,7 @@ from meshlab.fleet import VirtualNode
 from tests.meshctl.proof.rig import Rig
 from tests.waiting import until
 
-pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("fleet"), pytest.mark.timeout(600)]
+pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("fleet")]
 
 # What a flash that keeps the configuration leaves, and an init script before the last one that takes its time.
 KEPT = """

@@ -10,7 +10,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from tests.meshctl.proof.rig import Rig
 
-pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("rigs"), pytest.mark.timeout(600)]
+pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("rigs")]
 
 # What config_generate writes on a board whose ports are behind a switch, and a radio that the inventory leaves out.
 BOARD = """

@@ -18,7 +18,7 @@ import pytest
 
 from tests.meshctl.proof.rig import Ended, Rig
 
-pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("fleet"), pytest.mark.timeout(600)]
+pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("fleet")]
 
 RECORDED = Path(__file__).parent / "json_keys.json"
 # keys that are names of this fleet, MAC addresses, paths or file names, not words of the format

@@ -15,7 +15,7 @@ from tests.meshctl.proof.rig import Rig
 from tests.meshlab.luci import SNAPSHOT, await_rollback, edit, log_in, save_and_apply
 from tests.waiting import until
 
-pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("luci"), pytest.mark.timeout(900)]
+pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("luci")]
 
 WINDOW_S = 60
 NAME = "n001"

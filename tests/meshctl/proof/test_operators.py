@@ -14,7 +14,6 @@ from tests.meshctl.proof.wires import in_own_network
 pytestmark = [
     pytest.mark.lab,
     pytest.mark.xdist_group("rigs"),
-    pytest.mark.timeout(600),
     pytest.mark.skipif(not expects_postgresql(), reason="there is no PostgreSQL server (scripts/setup-postgresql)"),
 ]
 

@@ -9,7 +9,7 @@ import pytest
 from meshlab.images import opkg_package
 from tests.meshctl.proof.rig import Rig
 
-pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("rigs"), pytest.mark.timeout(600)]
+pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("rigs")]
 
 PACKAGES = {"kmod-batman-adv": (), "batctl-default": ("kmod-batman-adv",)}
 # As the kernel shows it while / is in memory (fstools, overlay.c); the shell that mounts it, and what the node runs

@@ -7,7 +7,7 @@ import pytest
 from tests.meshctl.proof.kills import strike_meshctl, strike_nodes
 from tests.meshctl.proof.rig import Rig
 
-pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("fleet"), pytest.mark.timeout(600)]
+pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("fleet")]
 
 
 def test_after_a_cut_every_node_is_old_or_new_and_a_resume_finishes(rig: Rig) -> None:

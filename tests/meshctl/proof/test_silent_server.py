@@ -9,7 +9,7 @@ import pytest
 from tests.meshctl.proof.rig import Rig
 from tests.waiting import until
 
-pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("rigs"), pytest.mark.timeout(600)]
+pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("rigs")]
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ import pytest
 from meshctl.inventory import load_fleet
 from tests.meshctl.proof.rig import Rig
 
-pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("rigs"), pytest.mark.timeout(600)]
+pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("rigs")]
 
 
 def _pins(directory: Path) -> list[str]:

@@ -14,7 +14,7 @@ from meshctl.device.trust import parse_pins
 from meshctl.inventory import load_fleet
 from tests.meshctl.proof.rig import Rig
 
-pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("rigs"), pytest.mark.timeout(600)]
+pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("rigs")]
 
 
 def test_a_device_that_took_over_is_recorded_after_ctrl_c_and_by_the_same_command(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ import pytest
 
 from tests.meshctl.proof.rig import COMMAND_LIMIT_S, Ended, Rig
 
-pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("fleet"), pytest.mark.timeout(600)]
+pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("fleet")]
 
 Event = dict[str, Any]
 

@@ -34,7 +34,6 @@ def test_the_community_has_sixty_houses_on_two_releases() -> None:
 
 @pytest.mark.lab
 @pytest.mark.xdist_group("tutorials")
-@pytest.mark.timeout(900)
 @pytest.mark.parametrize("page", PAGES)
 def test_every_command_of_a_tutorial_works(page: str, tmp_path: Path) -> None:
     copy = tmp_path / f"{page}.md"

@@ -10,7 +10,7 @@ import pytest
 
 from tests.meshctl.proof.wires import WIRES, in_own_network
 
-pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("rigs"), pytest.mark.timeout(600)]
+pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("rigs")]
 
 
 def test_two_devices_at_one_address_bootstrap_through_their_interfaces(tmp_path: Path) -> None:

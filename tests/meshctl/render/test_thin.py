@@ -96,6 +96,9 @@ def test_both_compute_the_same(link: ThinLink, tmp_path: Path) -> None:
     [own] = loaded(thin(ESTOP, ports={"lora": "/dev/x"}, lora=link), "uav", tmp_path).settings.thin.links
     assert own.airtime_s(50) == pytest.approx(link.airtime_s(50))
     assert own.largest_frame_bytes == link.largest_frame_bytes
+    core.check_thin("r" * link.longest_name_bytes, [], (own,))
+    with pytest.raises(ValueError, match=f"at most {link.longest_name_bytes} bytes"):
+        core.check_thin("r" * (link.longest_name_bytes + 1), [], (own,))
 
 
 def test_the_constants_are_those_of_the_transport() -> None:

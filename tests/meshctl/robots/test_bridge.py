@@ -8,9 +8,6 @@ from tests.meshctl.device.servers import eventually
 from tests.meshctl.robots.fleets import RobotFleet
 from tests.meshctl.robots.wheels import own_wheel_with
 
-# the first one may have to wait until the machines are built
-pytestmark = pytest.mark.timeout(600)
-
 # What ROS's own file of that name does, as far as it counts here.
 _SETUP = "export ROS_DISTRO=noetic ROS_MASTER_URI=http://localhost:11311\n"
 _MASTER = """\

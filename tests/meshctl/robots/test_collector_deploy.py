@@ -5,17 +5,12 @@ from __future__ import annotations
 import json
 from typing import Any
 
-import pytest
-
 from meshctl.device.trust import TrustStore
 from meshctl.render.rendered import LINKS_PATH
 from meshctl.resources import device_script
 from tests.meshctl.device.servers import eventually
 from tests.meshctl.robots.fleets import RobotFleet
 from tests.meshctl.robots.test_systemd import MAX_EXPOSURE
-
-# the first one may have to wait until the machines are built
-pytestmark = pytest.mark.timeout(600)
 
 # what a radio would print; the machine behind it is a Debian with OpenSSH
 IW = """\

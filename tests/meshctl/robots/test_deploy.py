@@ -10,9 +10,6 @@ from tests.meshctl.device.servers import eventually
 from tests.meshctl.robots.fleets import RobotFleet
 from tests.meshctl.robots.wheels import own_wheel_with
 
-# the first one may have to wait until the machines are built
-pytestmark = pytest.mark.timeout(600)
-
 # What a second deploy must leave as it is: every file with its time, and the process.
 _EVERYTHING = (
     "find /opt/udp-mesh /etc ! -name .lock -printf '%p %T@ %i\\n' | sort; systemctl show -p MainPID udp-mesh.service"

@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-import pytest
-
 from tests.meshctl.device.servers import eventually
 from tests.meshctl.robots.fleets import RobotFleet
 from tests.meshctl.robots.test_systemd import MAX_EXPOSURE
-
-# the first one may have to wait until the machines are built
-pytestmark = pytest.mark.timeout(600)
 
 
 def _address_of(fleet: RobotFleet, name: str, *, on: str) -> str:

@@ -17,9 +17,6 @@ from meshctl.wording import lock_owners
 from tests.meshctl.device.servers import PATIENCE_S, eventually
 from tests.meshctl.robots.fleets import RobotFleet
 
-# the first one may have to wait until the machines are built
-pytestmark = pytest.mark.timeout(600)
-
 
 class Finger:
     """Presses Ctrl-C so many times as soon as a file is there, each time when the one before was understood."""

@@ -2,12 +2,7 @@
 
 from __future__ import annotations
 
-import pytest
-
 from tests.meshctl.robots.fleets import RobotFleet
-
-# the first one may have to wait until the machines are built
-pytestmark = pytest.mark.timeout(600)
 
 _NOTHING = "ls -A /opt /etc/systemd/system"
 

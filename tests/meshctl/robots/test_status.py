@@ -5,14 +5,10 @@ from __future__ import annotations
 import json
 from typing import Any
 
-import pytest
 from typer.testing import CliRunner
 
 from meshctl.cli.main import build
 from tests.meshctl.robots.fleets import RobotFleet
-
-# the first one may have to wait until the machines are built
-pytestmark = pytest.mark.timeout(600)
 
 
 def document(fleet: RobotFleet, *words: str) -> dict[str, Any]:

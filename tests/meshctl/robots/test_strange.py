@@ -9,9 +9,6 @@ import pytest
 
 from tests.meshctl.robots.fleets import USER_PASSWORD, RobotFleet, give_user
 
-# the first one may have to wait until the machines are built
-pytestmark = pytest.mark.timeout(600)
-
 _HALF_DELETED = (
     "rm -r /opt/udp-mesh/trees",
     "rm /opt/udp-mesh/current/manifest",

@@ -6,9 +6,6 @@ import pytest
 
 from tests.meshctl.robots.fleets import USER_PASSWORD, RobotFleet, give_user
 
-# the first one may have to wait until the machines are built
-pytestmark = pytest.mark.timeout(600)
-
 
 def test_sudo_works_with_or_without_a_password_and_a_wrong_one_is_harmless(
     fleet: RobotFleet, monkeypatch: pytest.MonkeyPatch

@@ -11,9 +11,6 @@ import pytest
 from tests.meshctl.device.servers import eventually
 from tests.meshctl.robots.fleets import RobotFleet
 
-# the first one may have to wait until the machines are built
-pytestmark = pytest.mark.timeout(600)
-
 # `systemd-analyze security`, in tenths of a point from 0 (locked up) to 100 (does what it likes).
 MAX_EXPOSURE = 20
 PORT = "    thin: {number: 2, ports: {lora: /dev/ttyUSB0}}\n"

@@ -238,6 +238,10 @@ def test_switch_output_is_parsed_into_an_outcome() -> None:
     back = parse_switch("r", "id", "result=rolled-back\nreason=the daemon does not run\nlog=a=b\nlog=c\n")
     assert back.result is Result.ROLLED_BACK
     assert back.hint == "last log lines:\na=b\nc"
+    absent = "result=rolled-back-ill\nreason=peers were online before and are not seen: husky2\nlog=a\nstill="
+    gone = parse_switch("r", "id", f"{absent}peers were online before and are not seen: husky2\n")
+    assert gone.hint == "the new release may not be the cause: run the command again\nlast log lines:\na"
+    assert parse_switch("r", "id", f"{absent}the daemon does not run\n").hint == "last log lines:\na"
     assert parse_switch("r", "id", "").result is Result.FAILED
 
 

@@ -9,9 +9,6 @@ from tests.meshctl.robots.fleets import RobotFleet
 from tests.meshctl.robots.lan import Lan
 from tests.meshctl.robots.machine import Machine
 
-# the first one may have to wait until the machines are built
-pytestmark = pytest.mark.timeout(600)
-
 
 def test_a_robot_behind_its_radio_is_deployed_from_cached_pip_packages(
     fleet: RobotFleet, monkeypatch: pytest.MonkeyPatch

@@ -16,8 +16,7 @@ from tests.meshctl.robots.machine import debian
 from tests.meshctl.sites.gateway_machine import ADDRESS, HOME, NODES, OPERATOR, UNIT, USER, GatewayRig
 from tests.waiting import until
 
-# the first one may have to wait until the machine is built
-pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("nats"), pytest.mark.timeout(600)]
+pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("nats")]
 
 # `systemd-analyze security`, in tenths of a point: a login user's systemd can neither drop capabilities, which such a
 # user does not have, nor mount

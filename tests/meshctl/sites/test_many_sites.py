@@ -19,7 +19,6 @@ def _names(count: int) -> list[str]:
     return [f"s{number:02}" for number in range(1, count + 1)]
 
 
-@pytest.mark.timeout(600)
 def test_four_sites_of_five_nodes_end_right(tmp_path: Path) -> None:
     with NatsRig(tmp_path, dict.fromkeys(_names(4), 5), with_lab=False) as rig:
         ended = run_show(rig, _SEED, wait_s=400)

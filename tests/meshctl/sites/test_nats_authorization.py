@@ -24,7 +24,7 @@ from tests.meshctl.monitor.prometheus_program import free_tcp_port
 from tests.meshctl.sites.nats_servers import PROGRAM
 from tests.waiting import until
 
-pytestmark = [pytest.mark.xdist_group("nats"), pytest.mark.timeout(120)]
+pytestmark = [pytest.mark.xdist_group("nats")]
 PAGE = Path(__file__).parents[3] / "docs/how-to/permanent-sites.md"
 _NORTH = SiteSubjects("mines", "north")
 _LIMITS = stream_settings(1, 1 << 20)

@@ -28,7 +28,7 @@ from tests.meshctl.device.servers import keypair, public
 from tests.meshctl.sites.nats_servers import NatsServerProcess, NatsSites
 from tests.waiting import until
 
-pytestmark = [pytest.mark.xdist_group("nats"), pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.xdist_group("nats")]
 _SUBJECTS = SiteSubjects("mines", "north")
 _STREAM, _LIMITS = _SUBJECTS.run_stream, stream_settings(1, 1 << 20)
 

@@ -28,7 +28,7 @@ from tests.meshctl.monitor.prometheus_program import free_tcp_port
 from tests.meshctl.sites.nats_servers import NatsServerProcess
 from tests.waiting import until
 
-pytestmark = [pytest.mark.xdist_group("nats"), pytest.mark.timeout(120)]
+pytestmark = [pytest.mark.xdist_group("nats")]
 _NORTH = SiteSubjects("mines", "north")
 _DENIED = (_NORTH.ask, "$JS.API.STREAM.CREATE.>", "_INBOX.refused.>")
 INVENTORY = """\
@@ -134,3 +134,19 @@ def test_a_stream_that_may_not_be_made_is_named(hub: NatsServerProcess) -> None:
         # what was refused earlier is not the reason for something else, nor what another site was refused
         client.refusals.check(client.refusals.count)
         client.refusals.check(0, _NORTH.ask)
+
+
+def test_a_server_that_cannot_write_a_stream_needs_room_and_no_other_address(tmp_path: Path) -> None:
+    server = NatsServerProcess(tmp_path, "hub", "hub", {})
+    try:
+        # like a full disk, which refuses the directory of a stream
+        (server.store / "jetstream" / "$G").mkdir(parents=True, exist_ok=True)
+        (server.store / "jetstream" / "$G" / "streams").write_text("")
+        with (
+            closing(NatsClient(NatsServer(server.url))) as client,
+            pytest.raises(NatsLost, match="has no room") as lost,
+        ):
+            client.ensure_stream(name=_NORTH.order_stream, subjects=[_NORTH.orders], **stream_settings(1, 1 << 20))
+        assert "make room on the disk of the NATS server" in lost.value.hint
+    finally:
+        server.stop()

@@ -21,7 +21,7 @@ from meshlab.fleet import VirtualFleet, VirtualNode
 from tests.meshctl.sites.rig import LIMIT_S, NORTH, SECRETS, SOUTH, SitesRig
 from tests.waiting import until
 
-pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("sites"), pytest.mark.timeout(600)]
+pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("sites")]
 _EVERY = (*NORTH, *SOUTH)
 _PROVISION = ("provision", "--yes", "--json")
 # the canary of north: the others follow

@@ -19,7 +19,7 @@ from tests.meshctl.sites.nats_rig import NatsRig
 from tests.meshctl.sites.rig import NORTH, SECRETS, SOUTH, Ended
 from tests.waiting import until
 
-pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("nats"), pytest.mark.timeout(600)]
+pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("nats")]
 _EVERY = (*NORTH, *SOUTH)
 _PROVISION = ("provision", "--yes", "--json")
 _AT_WORK = '"node": "n[12]", "at_s": [0-9.]*, "text": "apply"'

@@ -256,3 +256,14 @@ def test_busybox_ash_parses_every_stand_in_script(script: str) -> None:
         subprocess.run((rootfs.find_program("busybox", "busybox-static"), "ash", "-n", path), check=True, timeout=60)
     else:
         assert path.suffix == ".awk"
+
+
+def test_only_the_first_base_is_always_on_the_operator_s_lan() -> None:
+    """Two factory devices on one LAN both answer at 192.168.1.1: bootstrap took one for the other."""
+    names = ("gate-a", "gate-b", "second", "crane")
+    nodes = tuple(NodeSpec(name, medium=Medium.BENCH if name == "crane" else Medium.BASE) for name in names)
+    spec = FleetSpec("harbor", nodes, lans=(LanSpec("office", ("gate-a", "second")), LanSpec("crane", ("crane",))))
+    hardware = hwsim_devices.node_hardware(spec)
+    assert [name for name in names if hwsim_devices.is_on_operator_lan(hardware[name], spec)] == ["gate-a"]
+    alone = FleetSpec("no-robots", (NodeSpec("base", medium=Medium.BASE),))
+    assert not hwsim_devices.is_on_operator_lan(hwsim_devices.node_hardware(alone)["base"], alone)

@@ -60,7 +60,6 @@ def test_everything_found_comes_home_through_a_robot_that_carries_it() -> None:
 
 
 @pytest.mark.proof
-@pytest.mark.timeout(900)
 @pytest.mark.parametrize("masters", [2, 3, 4])
 def test_everything_found_comes_home_after_minutes_without_a_link(masters: int) -> None:
     explores_and_comes_home(masters, LONG_CUT_S)

@@ -123,10 +123,12 @@ def effects_watched(team: RandomTeam) -> Iterator[None]:
         release_held(state, session, now)
         released = False
 
-    def broadcast(state: State, session: Session, frames: bytes, link: str, source: Address, now: float) -> None:
+    def broadcast(
+        state: State, session: Session, number: int, frames: bytes, link: str, source: Address, now: float
+    ) -> None:
         counters = state.event_queue.counters
         before = counters.dropped_unproven + counters.dropped_malformed + counters.dropped_stale
-        receive_broadcast(state, session, frames, link, source, now)
+        receive_broadcast(state, session, number, frames, link, source, now)
         if counters.dropped_unproven + counters.dropped_malformed + counters.dropped_stale == before:
             effects.on_broadcast(state, session)
             effects.check_age(state, session, timestamped=timestamp_of(frames) is not None)

@@ -95,10 +95,26 @@ def test_a_step_of_the_wall_clock_does_not_disturb_the_transport(
 
             return real(self, from_socket, step, limit, stop_after - step_s)
 
+        times: list[float] = []
+        taken, advanced = alice.driver.node.receive, alice.driver._advance_clock
+
+        def take(data: memoryview, link: str, source: Address, now: float) -> None:
+            times.append(now)
+            taken(data, link, source, now)
+
+        def advance() -> float:
+            times.append(advanced())
+            return times[-1]
+
+        monkeypatch.setattr(alice.driver.node, "receive", take)
+        monkeypatch.setattr(alice.driver, "_advance_clock", advance)
         monkeypatch.setattr(UdpLink, "_receive", receive)
         assert isinstance(await alice.deliver("map", PAYLOAD, to="bob"), MessageDelivered)
         (peer,) = alice.conditions().peers
         assert peer.online
+        # the core's time never goes back
+        assert len(times) > 10
+        assert times == sorted(times)
 
     run(body)
 

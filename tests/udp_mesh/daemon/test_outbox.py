@@ -259,3 +259,27 @@ def test_a_deleted_directory_is_reported_and_created_again(tmp_path: Path) -> No
     store.put(message(2))
     store.close()
     assert [kept.key for kept in DirectoryStore(tmp_path / "outbox", 1 << 20).load()] == [2]
+
+
+@pytest.mark.parametrize("closes", [False, True], ids=["while_it_runs", "when_it_closes"])
+def test_a_file_that_could_not_be_removed_is_removed_later(
+    closes: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A restart would send its message again. A directory in its place refuses like a read-only disk."""
+    monkeypatch.setattr("udp_mesh.daemon.outbox.REMOVE_AGAIN_S", 1000.0 if closes else 0.05)
+    store = DirectoryStore(tmp_path, 10_000)
+    store.put(message(7))
+    store.flush().result(WAIT_S)
+    (file,) = tmp_path.glob("*.message")
+    file.rename(tmp_path / "aside")
+    file.mkdir()
+    store.remove(7)
+    store.flush().result(WAIT_S)
+    file.rmdir()
+    (tmp_path / "aside").rename(file)
+    if closes:
+        store.close()
+    until(lambda: not file.exists(), "the file to be removed", wait_s=WAIT_S)
+    if not closes:
+        store.close()
+    assert DirectoryStore(tmp_path, 10_000).load() == []

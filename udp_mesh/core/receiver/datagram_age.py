@@ -46,7 +46,15 @@ def echo_age_s(echo: int, now: float) -> float:
 class Freshness:
     """Measurements of one boot's clock, in its milliseconds and our seconds."""
 
-    __slots__ = ("_offset_ms", "_set_at", "confirmed", "fresh_at", "trusted_until")
+    __slots__ = (
+        "_offset_ms",
+        "_set_at",
+        "broadcasts_resumed",
+        "confirmed",
+        "data_resumed",
+        "fresh_at",
+        "trusted_until",
+    )
 
     def __init__(self) -> None:
         self._offset_ms: int | None = None
@@ -55,6 +63,9 @@ class Freshness:
         """Its clock is compared with that of a datagram which was no recording."""
         self.fresh_at = float("-inf")
         """When something that cannot be a replay last came."""
+        self.data_resumed = self.broadcasts_resumed = False
+        """It is heard again after a silence of more than `ACCEPT_AGE_S`, and no number shows yet what is from before: a
+        datagram without a timestamp may be."""
         self.trusted_until = float("-inf")
         """Until then, datagrams without a timestamp are accepted without a check."""
 
@@ -87,13 +98,20 @@ class Freshness:
         if clock is not None:
             self._set(clock_ms(now) - clock & 0xFFFFFFFF, now)
 
+    def on_data_floor(self, now: float) -> None:
+        """The replay window rules out what was sent before the silence."""
+        self.data_resumed = False
+        self._is_fresh(now)
+
     def _set(self, offset_ms: int, now: float) -> None:
         self._offset_ms, self._set_at = offset_ms, now
         self._is_fresh(now)
 
     def _is_fresh(self, now: float) -> None:
+        if ACCEPT_AGE_S < now - self.fresh_at < float("inf"):
+            self.data_resumed = self.broadcasts_resumed = True
         self.fresh_at = now
-        self.trusted_until = now + CHALLENGE_AFTER_S
+        self.trusted_until = float("-inf") if self.data_resumed else now + CHALLENGE_AFTER_S
 
 
 def _signed(difference: int) -> int:

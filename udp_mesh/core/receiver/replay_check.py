@@ -2,7 +2,8 @@
 
 1. A datagram with a timestamp is as late as its sender's clock says (`datagram_age`).
 2. One without a timestamp (a fragment in the middle of a message) counts as fresh while its sender sent something fresh
-   recently; after that the sender is challenged.
+   recently; after that the sender is challenged. After a silence, one that is known to be fresh comes first: lower
+   numbers may be from before the silence.
 3. A datagram that is too late is dropped and its sender challenged (`path_validation`): the answer proves that it is
    there and corrects its clock. Pings are answered however late they are.
 """
@@ -39,7 +40,7 @@ def data_lateness_s(
         undated_s = now - session.freshness.fresh_at
         if undated_s > CHALLENGE_AFTER_S:
             validate_path(state, session, link, source, now)
-        if undated_s <= ACCEPT_AGE_S:
+        if undated_s <= ACCEPT_AGE_S and not session.freshness.data_resumed:
             return 0.0
     drop_stale(state, session, small_frames(frames), link, source, now)
     return None
@@ -85,10 +86,27 @@ def broadcast_lateness_s(
     heartbeats are numbered in the same channel."""
     clock = timestamp_of(frames)
     late_s = 0.0 if clock is None else session.freshness.lateness_s(clock, now)
-    if late_s <= ACCEPT_AGE_S:
+    is_undecided = clock is None and session.timed and session.freshness.broadcasts_resumed
+    if late_s <= ACCEPT_AGE_S and not is_undecided:
         return late_s
     drop_stale(state, session, (), link, source, now)
     return None
+
+
+def on_fresh_data(session: Session, number: int, now: float) -> None:
+    """A datagram with this number is fresh. After a silence, lower numbers may be from before it."""
+    if session.freshness.data_resumed and session.timed:
+        for channel in session.data_channels:
+            channel.window.raise_floor(number)
+        session.freshness.on_data_floor(now)
+
+
+def on_fresh_broadcast(session: Session, number: int) -> None:
+    """The same for a broadcast."""
+    if session.freshness.broadcasts_resumed and session.timed:
+        for channel in session.broadcast_channels:
+            channel.window.raise_floor(number)
+        session.freshness.broadcasts_resumed = False
 
 
 def timestamp_of(frames: bytes) -> int | None:

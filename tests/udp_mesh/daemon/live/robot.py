@@ -74,6 +74,7 @@ class Robot:
         self.reader: Reader | None = None
         self.writer: Writer | None = None
         self._filler = folder / f"{name}.disk" / "filler"
+        self._is_freed = True
         self._clock = folder / f"{name}.clock"
         self._clock.touch()
         self._counts_turns = version is None
@@ -180,6 +181,8 @@ state_directory = "{folder}/{self.name}.disk"
     def set_disk(self, access: str) -> None:
         """Make the disk read-only (`ro`) or writable (`rw`)."""
         run(f"mount -o remount,{access} {self._filler.parent}")
+        if access == "rw" and self._is_freed:
+            self.free_disk()
 
     def set_clock(self, offset_s: float) -> None:
         """Sets the daemon's wall clock to the host's and so much."""
@@ -187,13 +190,17 @@ state_directory = "{folder}/{self.name}.disk"
             file.write(f"{offset_s}\n")
 
     def fill_disk(self) -> None:
+        self._is_freed = False
         with contextlib.suppress(OSError), self._filler.open("wb") as file:
             while True:
                 file.write(bytes(4096))
                 file.flush()
 
     def free_disk(self) -> None:
-        self._filler.unlink(missing_ok=True)
+        """A disk that is read-only is freed once it is writable."""
+        self._is_freed = True
+        with contextlib.suppress(OSError):
+            self._filler.unlink(missing_ok=True)
 
     def usage(self) -> tuple[float, int]:
         """Seconds of processor used, and memory in bytes."""

@@ -1,0 +1,136 @@
+"""Mistakes in a first inventory that were silent, in too many findings, or with advice that did not help."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from meshctl.diagnostics import Diagnostic
+from meshctl.lint import Example, check_path
+from meshctl.lint.example import environment, write
+from meshctl.regdb import SHIPPED, load
+
+_REGDB = load(SHIPPED)
+_THIN = "udp_mesh: {thin_links: {lora: {bits_per_s: 5470, band: BAND}}}\n"
+_PORTS = """robots:
+  base-station: {thin: {number: 1, ports: {lora: PORT}}}
+  husky1: {thin: {number: 2, ports: {lora: /dev/ttyUSB0}}}
+"""
+
+
+def _found(fragment: str, directory: Path) -> list[Diagnostic]:
+    example = Example(fragment)
+    found = check_path(write(example, directory), _REGDB, environment(example)).diagnostics
+    return [one for one in found if one.severity.value != "note"]
+
+
+@pytest.mark.parametrize(("state", "codes"), [("spare", []), ("deployed", ["MC610"])])
+def test_a_spare_radio_of_robots_belongs_to_no_robot_yet(state: str, codes: list[str], tmp_path: Path) -> None:
+    fragment = f"nodes: {{spare1: {{role: robot, state: {state}, hardware: rocket, address: 10.42.0.77}}}}"
+    assert [one.code for one in _found(fragment, tmp_path)] == codes
+
+
+@pytest.mark.parametrize(
+    ("fragment", "code", "path"),
+    [
+        ("system: {log_host: 10.42.0.300}", "MC237", "system.log_host"),
+        ("system: {ntp_servers: [10.42.0, 5]}", "MC237", "system.ntp_servers.0"),
+        ("robots: {husky1: {computer: {ssh: {host: 10.42.0.300}}}}", "MC435", "robots.husky1.computer.ssh.host"),
+        ("robots: {husky1: {computer: {ssh: {jump: bsae}}}}", "MC105", "robots.husky1.computer.ssh.jump"),
+        ("nodes: {b01: {packages: [kmod-nft-brige]}}", "MC832", "nodes.b01.packages.0"),
+        ("nodes: {b01: {packages: [batman-adv]}}", "MC832", "nodes.b01.packages.0"),
+        (
+            _THIN.replace("BAND", "eu868") + _PORTS.replace("PORT", "/dev/ttyUSB1"),
+            "MC781",
+            "udp_mesh.thin_links.lora.band",
+        ),
+        (
+            "nodes: {b02: {state: lost, address: 10.42.0.78}, b01: {gateway: 10.42.0.78}}",
+            "MC223",
+            "nodes.b01.gateway",
+        ),
+    ],
+)
+def test_what_was_silent_is_reported(fragment: str, code: str, path: str, tmp_path: Path) -> None:
+    assert (code, path) in {(one.code, one.path) for one in _found(fragment, tmp_path)}
+
+
+@pytest.mark.parametrize("port", ["COM3", "ttyUSB0", "''", "'/dev/tty USB0'"])
+def test_a_serial_port_is_a_path(port: str, tmp_path: Path) -> None:
+    (finding,) = _found(_THIN.replace("BAND", "us915") + _PORTS.replace("PORT", port), tmp_path)
+    assert (finding.code, finding.path) == ("INV021", "robots.base-station.thin.ports.lora")
+    assert finding.expected == "the path of a serial port such as /dev/ttyUSB0 or /dev/serial/by-id/..."
+
+
+@pytest.mark.parametrize(("country", "band"), [("DE", "eu868"), ("US", "us915"), ("JP", "eu868"), ("US", "none")])
+def test_a_band_of_the_country_is_sound(country: str, band: str, tmp_path: Path) -> None:
+    fragment = f"country: {country}\n" + _THIN.replace("BAND", band) + _PORTS.replace("PORT", "/dev/ttyUSB1")
+    assert "MC781" not in {one.code for one in _found(fragment, tmp_path)}
+
+
+def test_the_own_address_as_gateway_is_named(tmp_path: Path) -> None:
+    """It said `not reachable from the node`, of its own address."""
+    (finding,) = _found("nodes: {b01: {address: 10.42.0.77, gateway: 10.42.0.77}}", tmp_path)
+    assert (finding.code, finding.message) == ("MC204", "it is the node's own address")
+    assert finding.hint.startswith("Write `gateway: null`")
+
+
+def test_a_wrong_network_is_one_finding(tmp_path: Path) -> None:
+    """Each node and computer outside had its own, unless all nodes were outside."""
+    fragment = """
+    meshes: {main: {network: 10.77.0.0/24}}
+    nodes: {"c[1-2]": {hardware: rocket, address: {rule: network + 200 + index}}}
+    """
+    found = [one for one in _found(fragment, tmp_path) if one.code in ("MC202", "MC209", "MC212", "MC213")]
+    assert [(one.code, one.path) for one in found] == [("MC202", "meshes.main.network")]
+
+
+def test_a_range_that_overlaps_another_is_one_finding(tmp_path: Path) -> None:
+    fragment = """
+    nodes:
+      "c[1-4]": {hardware: rocket, address: {from: 10.42.0.201}}
+      "d[1-4]": {hardware: rocket, address: {from: 10.42.0.203}}
+    """
+    (finding,) = [one for one in _found(fragment, tmp_path) if one.code == "MC201"]
+    assert (finding.path, finding.message) == ("nodes.d1.address", "d1, d2 have the addresses of c3, c4")
+
+
+def test_a_range_outside_the_network_is_one_finding(tmp_path: Path) -> None:
+    fragment = 'nodes: {"c[1-2]": {hardware: rocket, address: {from: 10.42.1.10}}}'
+    (finding,) = [one for one in _found(fragment, tmp_path) if one.code == "MC202"]
+    assert finding.message == "c1, c2 are outside their mesh's network"
+
+
+def test_thin_links_that_are_not_defined_are_one_finding(tmp_path: Path) -> None:
+    (finding,) = [one for one in _found(_PORTS.replace("PORT", "/dev/ttyUSB1"), tmp_path) if one.code == "MC772"]
+    assert finding.message == "no thin link is defined"
+
+
+@pytest.mark.parametrize(
+    ("carries", "hint"),
+    [
+        ("beacons", "a group: list its nodes (c1, c2), or a range of them"),
+        ("c*", 'patterns are for commands: list the nodes, or a range such as "b[01-03]"'),
+    ],
+)
+def test_a_group_or_a_pattern_is_not_what_a_robot_carries(carries: str, hint: str, tmp_path: Path) -> None:
+    fragment = f"""
+    groups: {{beacons: {{state: carried}}}}
+    nodes: {{"c[1-2]": {{hardware: rocket, groups: [beacons], address: {{from: 10.42.0.201}}}}}}
+    robots: {{husky1: {{carries: ["{carries}"]}}}}
+    """
+    assert [one.hint for one in _found(fragment, tmp_path) if one.code == "MC104"] == [hint]
+
+
+def test_a_radio_of_another_band_is_the_reason_for_no_mesh(tmp_path: Path) -> None:
+    found = _found("meshes: {main: {band: 5g, channel: 36}}", tmp_path)
+    assert {one.found for one in found if one.code in ("MC108", "MC619")} <= {
+        "none: radio0 is 2g, and mesh main is 5g",
+        "none",
+    }
+
+
+def test_a_label_is_shown_as_written(tmp_path: Path) -> None:
+    found = _found("nodes: {b01: {label: Box}, base: {label: BOX}}", tmp_path)
+    assert [(one.path, one.found) for one in found if one.code == "MC116"] == [("nodes.b01.label", "Box")]
