@@ -69,6 +69,7 @@ def no_answer_hint(place: BenchTarget, node: Node | None, *, is_pinned: bool) ->
         return ""
     return (
         f"check that it has booted and that this machine has an address in the network of {FACTORY_ADDRESS}; "
+        "if another device had this address a moment ago, try again: this machine still sends to that one; "
         "a device that is set up already answers at its address in the inventory instead"
     )
 

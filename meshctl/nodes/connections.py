@@ -9,14 +9,14 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
 from meshctl.device.authentication import own_keys
 from meshctl.device.connection import Credentials, Deadlines, Endpoint, OwnKey
-from meshctl.device.errors import ConnectionLost, Timeout
+from meshctl.device.errors import AuthenticationRefused, ConnectionLost, Timeout
 from meshctl.device.ssh import SshConnection, connect
 from meshctl.device.traffic import TrafficMeter
 from meshctl.device.trust import HostKeyPolicy, TrustStore
@@ -159,8 +159,12 @@ class ConnectionPool:
                     is_pinned_only = policy is None and self.policy is None
                     former = self._former_endpoint(node) if endpoint is None and is_pinned_only else None
                     if former is not None:
-                        with suppress(NodeError):
+                        try:
                             return connect_to(former)
+                        except (Unreachable, AuthenticationRefused) as elsewhere:
+                            error.args = (f"{error}; where it was last seen, {elsewhere}",)
+                        except NodeError:
+                            pass  # another device has that address by now
                     error.hint = self._site_hint(node) or error.hint
                     raise error from failure.__cause__
 

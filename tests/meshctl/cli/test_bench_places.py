@@ -81,7 +81,7 @@ def test_silence_on_the_bench_names_its_probable_reason(tmp_path: Path) -> None:
         assert "n1 has a pinned host key, so it is probably set up already and answers at 10.42.0.1" in text
         assert "`meshctl status n1`" in text
         assert "--replace-key" in text
-    assert "in the network of 192.168.1.1; a device that is set up" in no_answer_hint(
+    assert "in the network of 192.168.1.1; if another device had this address" in no_answer_hint(
         BenchTarget(), None, is_pinned=False
     )
     assert no_answer_hint(BenchTarget("10.0.0.9"), node, is_pinned=False) == ""

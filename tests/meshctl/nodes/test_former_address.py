@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from meshctl.device.errors import HostKeyUnknown
+from meshctl.device.errors import AuthenticationRefused, HostKeyUnknown
 from meshctl.device.observation import Observation
 from meshctl.device.trust import AcceptAnyKey, TrustStore
 from meshctl.errors import Unreachable
@@ -71,6 +71,18 @@ def test_another_device_at_the_former_address_is_not_taken_for_the_node(
     with pytest.raises(Unreachable, match="timed out"):
         pool(tmp_path).open(FLEET.nodes["b01"])
     assert tried[0] == ["10.42.0.101", "10.43.0.7"]
+
+
+@pytest.mark.parametrize(
+    "error", [AuthenticationRefused("b01 (10.43.0.7): login refused"), Unreachable("b01 (10.43.0.7): timed out")]
+)
+def test_what_is_met_where_a_node_was_last_seen_is_reported_too(
+    tmp_path: Path, tried: tuple[list[str], dict[str, Exception]], error: Exception
+) -> None:
+    tried[1]["10.43.0.7"] = error
+    with pytest.raises(Unreachable) as caught:
+        pool(tmp_path).open(FLEET.nodes["b01"])
+    assert str(caught.value) == f"timed out; where it was last seen, {error}"
 
 
 def test_a_connection_that_proves_an_address_or_pins_a_key_uses_no_other_address(
