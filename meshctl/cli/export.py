@@ -36,6 +36,7 @@ class ExportFormat(Enum):
     LABELS = "labels"
 
 
+_PAPER = "L7160"
 _HOST_LISTS = (ExportFormat.SSH_CONFIG, ExportFormat.ANSIBLE)
 _SELECTABLE = (ExportFormat.CSV, ExportFormat.NETJSON_CONFIG, ExportFormat.LABELS)
 
@@ -47,8 +48,13 @@ def export(
     format: Annotated[ExportFormat, typer.Option("--format", "-f", help="What to write.")] = ExportFormat.SSH_CONFIG,
     out: Annotated[Path | None, typer.Option("--out", help="Write to this file instead of standard output.")] = None,
     sheet: Annotated[
-        str, typer.Option("--sheet", help="Label paper: 5160 (Letter, 30 labels) or L7160 (A4, 21 labels).")
-    ] = "L7160",
+        str,
+        typer.Option(
+            "--sheet",
+            help=f"Label paper: 5160 (Letter, 30 labels) or L7160 (A4, 21 labels); default {_PAPER}.",
+            show_default=False,
+        ),
+    ] = "",
     skip: Annotated[int, typer.Option("--skip", help="Labels of the first sheet that are already used.")] = 0,
     outlines: Annotated[
         bool, typer.Option("--outlines", help="Draw the labels' edges, to cut plain paper or to check the position.")
@@ -74,8 +80,11 @@ def export(
         kinds = ", ".join(each.value for each in _SELECTABLE)
         raise InputError(f"--format {format.value} exports the whole fleet", hint=f"select nodes for {kinds}")
     if format is ExportFormat.LABELS:
-        _write_labels(fleet, selected_nodes(fleet, nodes, limit), out, sheet, skip=skip, outlines=outlines)
+        _write_labels(fleet, selected_nodes(fleet, nodes, limit), out, sheet or _PAPER, skip=skip, outlines=outlines)
         return
+    for option, given in {"--sheet": sheet, "--skip": skip, "--outlines": outlines}.items():
+        if given:
+            raise InputError(f"{option}: --format {format.value} prints no labels", hint="add `--format labels`")
     if format in _HOST_LISTS:
         text = _hosts(fleet, format, lab_at(lab, inventory)[0])
     else:

@@ -171,6 +171,10 @@ def test_wrong_paper_and_a_missing_extra_say_what_to_do(monkeypatch: pytest.Monk
     wrong = run("-i", inventory, "--format", "labels", "--sheet", "5161", "--out", str(tmp_path / "a.pdf"))
     assert wrong.exit_code == 2
     assert "expected one of 5160, L7160" in wrong.output
+    for option in (("--sheet", "5160"), ("--skip", "2"), ("--outlines",)):
+        other = run("-i", inventory, "--format", "csv", *option)
+        assert other.exit_code == 2
+        assert f"{option[0]}: --format csv prints no labels" in other.output
     monkeypatch.setitem(sys.modules, "segno", None)
     missing = run("-i", inventory, "--format", "labels", "--out", str(tmp_path / "a.pdf"))
     assert missing.exit_code == 2
