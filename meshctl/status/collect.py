@@ -23,7 +23,7 @@ from meshctl.device.observe import RawObservation, observe_raw
 from meshctl.errors import MeshctlError, NodeError, Unreachable
 from meshctl.fleet.journal import ROBOT_PREFIX, Journal
 from meshctl.model import Fleet, Node
-from meshctl.nodes.collect import facts_of, fleet_graph, known_macs
+from meshctl.nodes.collect import facts_of, fleet_graph, known_macs, reports_of
 from meshctl.nodes.connections import ConnectionPool
 from meshctl.nodes.desired import Renderer
 from meshctl.nodes.site_gateways import PIN_PREFIX
@@ -39,7 +39,6 @@ from meshctl.status.last_known import merge_by_device
 from meshctl.status.pings import Pings, ping, pings_of
 from meshctl.status.unreachable import NOT_ASKED, no_answer_of
 from meshctl.status.values import NoAnswer
-from meshctl.topology import Report, report_of
 
 if TYPE_CHECKING:
     from meshctl.status.site_observer import SiteObserver
@@ -105,20 +104,7 @@ class Collector:
             jobs["site", site] = partial(self._ask_site, site, tuple(names))
         for robot in targets:
             jobs["robot", robot] = partial(self._collect_robot, robot)
-        reports: dict[str, Report] = {}
-        plans: dict[str, NodePlan] = {}
-        fingerprints = Fingerprints(secrets.token_bytes(_SALT_BYTES))
-
-        def evaluate(key: tuple[str, str], answer: object) -> None:
-            """What takes time, while other devices still answer."""
-            for name, observation in (answer if isinstance(answer, Mapping) else {key[1]: answer}).items():
-                if isinstance(observation, Observation):
-                    reports[name] = report_of(name, observation)
-                    if not isinstance(self._desired_state(asked[name]), str):
-                        exact = self.renderer.desired(asked[name], observation)
-                        plans[name] = node_plan(exact, observation, fingerprints, owner=self.owner)
-
-        answers = run_parallel(jobs, MAX_PARALLEL, progress, evaluate)
+        answers = run_parallel(jobs, MAX_PARALLEL, progress)
         for site in at_sites:
             of_site = answers.pop(("site", site))
             assert isinstance(of_site, Mapping)
@@ -133,14 +119,15 @@ class Collector:
                 no_answer[kind][name] = no_answer_of(answer)
             elif isinstance(answer, NoAnswer):
                 no_answer[kind][name] = answer
-        reports = {name: reports[name] for name in observations}
+        # a report is made of all paths that a node knows: once
+        reports = reports_of(observations)
         self.journal.remember_all(
             self.fleet.name, {name: facts_of(observation) for name, observation in observations.items()}, self.clock()
         )
         macs = known_macs(self.fleet, known)
         for report in reports.values():
             macs.update(dict.fromkeys(report.macs, report.node))
-        unrendered = {name: reason for name in asked if isinstance(reason := self._desired_state(asked[name]), str)}
+        plans, unrendered = self._plans(asked.values(), observations)
         for robot in targets:
             if isinstance(expected := self._expected_release(robot), str):
                 unrendered[f"{ROBOT_PREFIX}{robot}"] = expected
@@ -150,7 +137,7 @@ class Collector:
             fleet=self.fleet,
             observations=observations,
             no_answer=no_answer["node"],
-            plans={name: plans[name] for name in asked if name in plans},
+            plans=plans,
             reports=reports,
             graph=fleet_graph(self.fleet, known, reports),
             known=merge_by_device(known),
@@ -271,6 +258,22 @@ class Collector:
                     self._desired_states[node.name] = first_line(error)
             return self._desired_states[node.name]
 
+    def _plans(
+        self, nodes: Iterable[Node], observations: Mapping[str, Observation]
+    ) -> tuple[dict[str, NodePlan], dict[str, str]]:
+        """The drift of each node that answered, and why others could not be compared."""
+        fingerprints = Fingerprints(secrets.token_bytes(_SALT_BYTES))
+        plans: dict[str, NodePlan] = {}
+        unrendered: dict[str, str] = {}
+        for node in nodes:
+            observation, desired = observations.get(node.name), self._desired_state(node)
+            if isinstance(desired, str):
+                unrendered[node.name] = desired
+            elif observation is not None:
+                exact = self.renderer.desired(node, observation)
+                plans[node.name] = node_plan(exact, observation, fingerprints, owner=self.owner)
+        return plans, unrendered
+
     def _collect_robot(self, robot: str) -> RobotFacts:
         expected = self._expected_release(robot)
         others = self.fleet.robots[robot].other_addresses
@@ -318,12 +321,10 @@ def run_parallel(
     jobs: Mapping[K, Callable[[], object]],
     parallel: int,
     progress: Progress = _no_progress,
-    evaluate: Callable[[K, object], None] = lambda key, answer: None,
     *,
     stall_timeout_s: float = STALL_TIMEOUT_S,
 ) -> dict[K, object]:
-    """Each job's result, or the NodeError it raised, in the jobs' order. Raises any other exception. `evaluate` is
-    called in the caller's thread with each result as it comes.
+    """Each job's result, or the NodeError it raised, in the jobs' order. Raises any other exception.
 
     `parallel` jobs run at once, and `parallel` more whenever none has ended for `stall_timeout_s`. Threads are daemons,
     so an interrupt need not wait for them.
@@ -362,5 +363,4 @@ def run_parallel(
             raise bug
         found[key] = answer
         progress(len(found), len(jobs))
-        evaluate(key, answer)
     return {key: found[key] for key in jobs}
