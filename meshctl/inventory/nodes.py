@@ -265,10 +265,8 @@ class _Building:
         return ip_interface((value, self._prefix_length(value, template.network)))
 
     def _bands(self, node: Node) -> str:
-        """A hint for a node that is in no mesh: `radio0 is 5g, and mesh main is 2g`."""
-        radios = ", ".join(f"{radio.name} is {radio.hardware.band.value}" for radio in node.radios)
-        meshes = ", ".join(f"mesh {mesh.name} is {mesh.band.value}" for mesh in self.meshes.values())
-        return f"{radios}, and {meshes}" if radios and meshes else ""
+        """A hint for a node that is in no mesh."""
+        return node.bands_beside(self.meshes.values()) if node.radios and self.meshes else ""
 
     def _prefix_length(self, address: IpAddress, network: IpNetwork | None) -> int:
         """The prefix length of the node's mesh, or that of a mesh with the address; else all bits."""

@@ -147,6 +147,11 @@ class Node:
         joined = (radio.mesh for radio in self.radios if radio.mesh is not None)
         return {f"mesh{index}": mesh for index, mesh in enumerate(joined)}
 
+    def bands_beside(self, meshes: Iterable[Mesh]) -> str:
+        """The bands of its radios and of the meshes: `radio0 is 5g, and mesh main is 2g`."""
+        radios = ", ".join(f"{radio.name} is {radio.hardware.band.value}" for radio in self.radios)
+        return f"{radios}, and {', '.join(f'mesh {mesh.name} is {mesh.band.value}' for mesh in meshes)}"
+
     @property
     def meshes(self) -> tuple[str, ...]:
         """The names of the meshes its radios join, each once, in the radios' order."""

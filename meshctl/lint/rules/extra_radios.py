@@ -38,7 +38,7 @@ _OPTIONS = {
         password routing_algo gw_mode gw_bandwidth gw_sel_class hop_penalty orig_interval fragmentation
         aggregated_ogms ap_isolation bonding bridge_loop_avoidance distributed_arp_table isolation_mark log_level
         multicast_mode multicast_fanout network_coding multicast_forceflood master elp_interval throughput_override
-        hop_penalty private_key listen_port addresses fwmark
+        private_key listen_port addresses fwmark
     """,
     ("firewall", "zone"): """
         name network device subnet input output forward masq masq6 masq_allow_invalid masq_src masq_dest mtu_fix

@@ -48,10 +48,7 @@ def unmeshed(fleet: Fleet, node: Node) -> str:
     bands = {mesh.band for mesh in fleet.meshes.values()}
     if not node.radios or any(radio.hardware.band in bands for radio in node.radios):
         return "none"
-    radios = ", ".join(f"{radio.name} is {radio.hardware.band.value}" for radio in node.radios)
-    return (
-        f"none: {radios}, and {', '.join(f'mesh {mesh.name} is {mesh.band.value}' for mesh in fleet.meshes.values())}"
-    )
+    return f"none: {node.bands_beside(fleet.meshes.values())}"
 
 
 @fleet_rule(
