@@ -125,8 +125,7 @@ class DirectoryStore:
         try:
             path.unlink(missing_ok=True)
         except OSError:
-            self._unremoved.add(key)
-            self._remove_again_later()
+            self._remove_later(key)
         with self._lock:
             self.bytes -= self._sizes.pop(key, 0)
             self._refuse("outbox-write-failed", f"path={path} error={error}")
@@ -157,8 +156,7 @@ class DirectoryStore:
     def _unlink(self, key: int) -> None:
         self._unsynced.pop(key, None)
         if not self._is_unlinked(key):
-            self._unremoved.add(key)
-            self._remove_again_later()
+            self._remove_later(key)
 
     def _is_unlinked(self, key: int) -> bool:
         path = self._path(key)
@@ -171,8 +169,9 @@ class DirectoryStore:
             return False
         return True
 
-    def _remove_again_later(self) -> None:
-        if self._removal_timer is None:
+    def _remove_later(self, *keys: int) -> None:
+        self._unremoved.update(keys)
+        if self._unremoved and self._removal_timer is None:
             self._removal_timer = threading.Timer(REMOVE_AGAIN_S, self._request_removal)
             self._removal_timer.daemon = True
             self._removal_timer.start()
@@ -185,8 +184,7 @@ class DirectoryStore:
     def _remove_again(self) -> None:
         self._removal_timer = None
         self._unremoved = {key for key in self._unremoved if not self._is_unlinked(key)}
-        if self._unremoved:
-            self._remove_again_later()
+        self._remove_later()
 
     def holds(self, key: int) -> bool:
         """Whether it is on disk or queued to be written."""
