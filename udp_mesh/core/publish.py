@@ -41,6 +41,7 @@ from udp_mesh.wire.fragment import FRAGMENT_BYTES, HEAD_BYTES, LENGTH_BYTES
 from udp_mesh.wire.frames import Feature, MessageFlag
 from udp_mesh.wire.legacy import LEGACY_OVERHEAD_BYTES
 from udp_mesh.wire.limits import MAX_TYPE_BYTES
+from udp_mesh.wire.thin import ThinBody
 
 RELEASE_BATCH = 400
 """Outbox messages queued at a time: some milliseconds, in which no urgent message can be sent."""
@@ -98,6 +99,27 @@ def send(
         accepted = numbered(_accept(message_id, channel, payload, packed, now, zstd=zstd), thin_number)
         _enqueue_all(state, accepted, names, now)
     return message_id
+
+
+def send_later(
+    state: State,
+    message_id: MessageId,
+    topic_name: str,
+    body: ThinBody,
+    name: str,
+    *,
+    accepted_at: float,
+    thin_number: int,
+    now: float,
+) -> bool:
+    """Queue a message that only thin links carried so far to a peer that is online now, under its identifier and number
+    of before. False if there is no room, or no such topic any more."""
+    topic = state.named_topic(topic_name)
+    channel = None if topic is None else topic_channel(state, topic, body.type_name)
+    if topic is None or channel is None or check_capacity(state, topic, [name], len(body.payload)) is not None:
+        return False
+    enqueue(state, name, numbered(_accept(message_id, channel, body.payload, None, accepted_at), thin_number), now)
+    return True
 
 
 def compress_step(state: State, now: float) -> None:

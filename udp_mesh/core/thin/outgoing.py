@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 from udp_mesh.core.events import MessageId
 from udp_mesh.wire.limits import MAX_THIN_PARTS
-from udp_mesh.wire.thin import Part
+from udp_mesh.wire.thin import Part, ThinBody
 
 LIFE_S = 120.0
 """How long a message without a deadline is tried; an urgent one for all reaches who appears within this time."""
@@ -38,8 +38,8 @@ class ThinMessage:
     accepted_at: float
     ends_at: float
     not_before: float = 0.0
-    alone: bool = False
-    """Only thin links carry it, so its outcome is reported here."""
+    alone: ThinBody | None = None
+    """The message itself, while only thin links carry it: its outcome is reported here."""
     lacking: dict[int, int] = field(default_factory=dict)
     """Number of each receiver that has not acknowledged it -> bits of the parts that it has."""
     acknowledged: set[int] = field(default_factory=set)

@@ -1,8 +1,9 @@
 """Messages of thin topics out: to the datagram links as ever, and to thin links, each with its outcome once.
 
-Urgent messages take all their links at once; others take thin links while some receiver is not online elsewhere. All
-copies carry one number, by which receivers drop those that come later. An acknowledgment on a thin link ends the
-message on the datagram links for that receiver, and a datagram that was delivered ends it on thin links.
+Urgent messages take all their links at once; others take thin links while some receiver is not online elsewhere. A
+message for a node that only thin links reach takes the others as soon as it is online there (`hand_over`). All copies
+carry one number, by which receivers drop those that come later. An acknowledgment on a thin link ends the message on
+the datagram links for that receiver, and a datagram that was delivered ends it on thin links.
 """
 
 from __future__ import annotations
@@ -55,7 +56,7 @@ class ThinSending:
             self._state.event_queue.counters.messages_sent += 1
         self._next_number = number + 1 & 0xFFFF
         names: tuple[str | None, ...] = (destination,) if destination is not None else topic.destinations or (None,)
-        body = encode_body(ThinBody(type_name, payload))
+        body = ThinBody(type_name, payload)
         for name in names:
             if name != self._state.settings.name:
                 self._send(number, outcome, topic, body, name, now, alone=alone)
@@ -66,7 +67,7 @@ class ThinSending:
         number: int,
         message_id: MessageId,
         topic: Topic,
-        body: bytes,
+        body: ThinBody,
         destination: str | None,
         now: float,
         *,
@@ -82,7 +83,7 @@ class ThinSending:
         links = self._links_of(topic)
         if not links or not (urgent or needing):
             return
-        parts = divide(body, min(link.part_bytes for link in links))
+        parts = divide(encode_body(body), min(link.part_bytes for link in links))
         if parts is None:
             self.too_large += 1
             if alone:
@@ -100,7 +101,7 @@ class ThinSending:
             parts,
             now,
             now + (LIFE_S if topic.deadline_s is None else topic.deadline_s),
-            alone=alone,
+            alone=body if alone else None,
         )
         if topic.thin_period_s is not None:
             message.not_before = self._sent_at.get(topic.name, float("-inf")) + topic.thin_period_s
@@ -149,6 +150,25 @@ class ThinSending:
         for message in composed.messages:
             self._sent_at[message.topic] = now
 
+    def hand_over(self, now: float) -> None:
+        """Reliable messages that only thin links carried so far take the datagram links as well, once their receiver
+        is online there."""
+        for message in self._messages:
+            peer = None if message.destination is None else self._peers.peers.get(message.destination)
+            if message.alone is None or message.ended or not message.reliable or peer is None:
+                continue
+            if not self.is_only_thin(peer) and publish.send_later(
+                self._state,
+                message.message_id,
+                message.topic,
+                message.alone,
+                peer.name,
+                accepted_at=message.accepted_at,
+                thin_number=message.number,
+                now=now,
+            ):
+                message.alone = None
+
     def expire(self, now: float) -> None:
         """End what has taken too long."""
         for message in self._messages:
@@ -165,7 +185,7 @@ class ThinSending:
 
     def _end(self, message: ThinMessage, reason: ExpiryReason) -> None:
         topic = self._state.topics.get(message.topic)
-        if not message.ended and message.alone and topic is not None:
+        if not message.ended and message.alone is not None and topic is not None:
             for number in message.lacking:
                 peer = self._peers.peers.get(number)
                 self._expired(message.message_id, "" if peer is None else peer.name, topic, reason)
@@ -198,7 +218,7 @@ class ThinSending:
             del message.lacking[peer.number]
             message.acknowledged.add(peer.number)
             topic = self._state.topics.get(message.topic)
-            if message.alone:
+            if message.alone is not None:
                 self._state.event_queue.counters.messages_delivered += 1
                 latency_s = now - message.accepted_at
                 self._state.event_queue.emit(MessageDelivered(message.message_id, peer.name, message.topic, latency_s))

@@ -216,6 +216,7 @@ class ThinLinks:
             if peer is None or not peer.is_present(now):
                 self._state.event_queue.emit(ThinPeerSilent(self._present.pop(number)))
         self.sending.expire(now)
+        self.sending.hand_over(now)
 
     def set_up(self, name: str, up: bool, now: float) -> None:
         """The link's device is there, or not."""

@@ -203,6 +203,26 @@ def test_a_peer_that_only_thin_links_reach_ends_a_message_as_expired_if_it_is_si
     assert other.reason is RejectReason.UNKNOWN_PEER
 
 
+@pytest.mark.parametrize("topic", [ESTOP.name, REPORT.name])
+@pytest.mark.parametrize("silent", [True, False], ids=["out of range of the thin link", "thin link works"])
+def test_what_only_thin_links_carry_takes_the_wifi_of_a_robot_that_appears_there(topic: str, silent: bool) -> None:
+    fleet = met("base", "husky")
+    if silent:
+        fleet.apart.add("husky")
+    message = fleet.send("base", topic, b"return" + bytes(300), "husky")
+    assert isinstance(message, int)
+    fleet.run(0.1)
+    assert fleet.received("husky") == []
+    fleet.wifi |= {"base", "husky"}
+    assert fleet.run(8, until=lambda: bool(fleet.reported("base", MessageDelivered)))
+    fleet.run(200)
+    assert len(fleet.received("husky", topic)) == 1
+    [event] = fleet.reported("base", MessageDelivered)
+    assert isinstance(event, MessageDelivered)
+    assert (event.message_id, event.peer) == (message, "husky")
+    assert fleet.reported("base", MessageExpired) == []
+
+
 def test_a_node_that_closes_ends_what_only_thin_links_carry() -> None:
     fleet = met("base", "husky")
     fleet.apart.add("husky")
