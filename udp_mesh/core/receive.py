@@ -28,7 +28,6 @@ from udp_mesh.core.sender.send_state import SendState
 from udp_mesh.core.settings import Address
 from udp_mesh.core.state import State
 from udp_mesh.crypto import (
-    TO_ALL,
     Key,
     OpenError,
     ReceiveChannel,
@@ -234,8 +233,8 @@ def _receive_long(
         decoded = decode(frames)
         beat = _beat(decoded)
     else:
-        channel = ReceiveChannel(key, header.boot_id, state.boot_id if introduced else TO_ALL)
-        number, frames = channel.open_long(data, header)
+        number, frames = state.unknown_boots.channel(key, header).open_long(data, header)
+        state.unknown_boots.forget(key, header)
         decoded = decode(frames)
         beat = _beat(decoded)
         if beat is None:

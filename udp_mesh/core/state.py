@@ -20,6 +20,7 @@ from udp_mesh.core.peers.heartbeat import HeartbeatScheduler
 from udp_mesh.core.peers.key_mismatch import KeyMismatchLimiter
 from udp_mesh.core.peers.peer_table import PeerTable
 from udp_mesh.core.peers.session import Peer, Session
+from udp_mesh.core.peers.unknown_boots import UnknownBoots
 from udp_mesh.core.priority_backoff import PriorityBackoff
 from udp_mesh.core.sender.message import TopicChannel
 from udp_mesh.core.sender.rate_limit import TokenBucket
@@ -62,6 +63,7 @@ class State:
         self.keys = live_keys(settings)
         self.links: dict[str, LinkInfo] = {}
         self.peer_table = PeerTable(settings, boot_id)
+        self.unknown_boots = UnknownBoots(boot_id)
         self.sent = Meter(now)
         """Wire bytes sent by this node to all nodes."""
         self.channel_share = ChannelShare()
