@@ -57,6 +57,11 @@ def with_settings(text: str, settings: Settings, file: str, named: frozenset[str
     edited = EditedText(text)
     for path, value in settings:
         edited = _with_setting(edited, path, value, file, named)
+        try:
+            compose(edited.text)
+        except yaml.YAMLError as error:
+            # `-` and `a: b` are values in a list, as which they were checked, and not here
+            raise SweepError(f"--set {path}={value}: expected one YAML value, found {value!r}") from error
     return edited
 
 

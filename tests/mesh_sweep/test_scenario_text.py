@@ -84,6 +84,10 @@ def _put(tree: Any, steps: list[str | int], value: Any) -> None:
         ("seed", "1], [2", "--set seed=1], [2: expected one YAML value, found '1], [2'"),
         ("seed", "&x 1", "--set seed=&x 1: expected one YAML value, found '&x 1'"),
         ("seed", "*x", "--set seed=*x: expected one YAML value, found '*x'"),
+        ("seed", "a: b", "--set seed=a: b: expected one YAML value, found 'a: b'"),
+        ("seed", "{}: {}", "--set seed={}: {}: expected one YAML value, found '{}: {}'"),
+        ("seed", "{}:{}", "--set seed={}:{}: expected one YAML value, found '{}:{}'"),
+        ("seed", "-", "--set seed=-: expected one YAML value, found '-'"),
         ("seed", "1 # x", "--set seed=1 # x: expected one YAML value, found '1 # x'"),
     ],
 )
