@@ -134,7 +134,7 @@ def run_context(
 
 
 # commands that are repeated with their arguments, as no other one takes them up
-_WITH_ARGUMENTS = ("restore", "replace")
+_WITH_ARGUMENTS = ("bootstrap", "restore", "replace")
 
 
 def retry_hint(command: str, undoes: int | None = None) -> str:

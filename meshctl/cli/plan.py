@@ -261,7 +261,8 @@ def resume(
             return
         if not as_json:
             echo(f"resuming run {record.id} ({record.command}): {', '.join(names)}")
-        recorded = json.loads(record.plan).get("choices", {}) if record.plan else {}
+        written = json.loads(record.plan) if record.plan else {}
+        recorded, origin = written.get("choices", {}), written.get("origin", record.command)
         added = choices_of(opened.fleet, False, leave_behind, accept_cut)
         choices = PlanOptions(
             bool(recorded.get("with_firmware", True)),
@@ -275,14 +276,23 @@ def resume(
             ended = change_everywhere(opened, inventory, own, sites, options, yes=yes, brief=brief, dry_run=dry_run)
             raise _ended_without(unknown, ended)
         prepared = prepare_plan(opened, names, choices, reconnects=not dry_run)
-        for line in bench_advice(record, prepared.plan):
+        for line in bench_advice(record.id, origin, prepared.plan):
             echo(line, err=True)
         for name, text in resolutions(record.id, opened.journal.outcomes(record.id), prepared).items():
             line = json.dumps({"event": "note", "node": name, "at_s": round(time.time(), 3), "text": text})
             echo(line if as_json else f"{name}: {text}")
         try:
             confirm_and_execute(
-                opened, prepared, "resume", choices, yes=yes, as_json=as_json, brief=brief, rate=rate, dry_run=dry_run
+                opened,
+                prepared,
+                "resume",
+                choices,
+                yes=yes,
+                as_json=as_json,
+                brief=brief,
+                rate=rate,
+                dry_run=dry_run,
+                origin=origin,
             )
         except typer.Exit as exited:
             raise _ended_without(unknown, exited) from None
@@ -293,17 +303,18 @@ def _ended_without(unknown: Collection[str] | None, ended: typer.Exit) -> typer.
     return typer.Exit(ExitCode.UNREACHABLE) if unknown and ended.exit_code == ExitCode.OK else ended
 
 
-def bench_advice(record: RunRecord, plan: Plan) -> tuple[str, ...]:
+def bench_advice(run: int, command: str, plan: Plan) -> tuple[str, ...]:
     """Advice for a replacement, which resume does not record in the inventory, and for unreachable nodes of a
-    bootstrap: resume uses their inventory address, which they may not have yet."""
+    bootstrap: resume uses their inventory address, which they may not have yet. `command` is that of the run, or of
+    the first one that it resumed."""
     unreachable = [node.node for node in plan.of(Verdict.AWAY)]
-    if record.command == "replace" and not unreachable:
+    if command == "replace" and not unreachable:
         return (f"hint: run the same `meshctl replace {' '.join(plan.nodes)} NEW` again to record it in the inventory",)
-    if record.command not in ("bootstrap", "replace") or not unreachable:
+    if command not in ("bootstrap", "replace") or not unreachable:
         return ()
     return (
-        f"run {record.id} was a {record.command}: {', '.join(unreachable)} may still have factory defaults",
-        f"hint: connect such a device on the bench and run `meshctl {record.command}` again",
+        f"run {run} was a {command}: {', '.join(unreachable)} may still have factory defaults",
+        f"hint: connect such a device on the bench and run `meshctl {command}` again",
     )
 
 

@@ -157,10 +157,11 @@ def confirm_and_execute(
     rate: float | None,
     dry_run: bool = False,
     undoes: int | None = None,
+    origin: str = "",
     on_outcomes: OnOutcomes = ignore_outcomes,
 ) -> None:
-    """Show the plan, ask, execute it and exit; `undoes` is the run that a rollback takes back, `on_outcomes` as for
-    `execute_plan`."""
+    """Show the plan, ask, execute it and exit; `undoes` is the run that a rollback takes back, `origin` and
+    `on_outcomes` as for `execute_plan`."""
     from meshctl.report.plan_text import question
 
     if dry_run:
@@ -179,6 +180,7 @@ def confirm_and_execute(
         rate=rate,
         choices=choices,
         undoes=undoes,
+        origin=origin,
         on_outcomes=on_outcomes,
     )
 
@@ -208,10 +210,12 @@ def execute_plan(
     rate: float | None,
     choices: PlanOptions | None = None,
     undoes: int | None = None,
+    origin: str = "",
     on_outcomes: OnOutcomes = ignore_outcomes,
 ) -> None:
-    """Execute the plan, journal it, print the totals, exit. `on_outcomes` gets the outcomes before the totals are
-    printed: the exit code alone does not tell what became of a node, for example after Ctrl-C."""
+    """Execute the plan, journal it, print the totals, exit. `origin` is the command of the run that it resumes.
+    `on_outcomes` gets the outcomes before the totals are printed: the exit code alone does not tell what
+    became of a node, for example after Ctrl-C."""
     plan = prepared.plan
     if plan.refusal:
         raise PlanRefused(plan.refusal, hint=plan.refusal_hint)
@@ -219,6 +223,7 @@ def execute_plan(
     stages = [[stage.kind.value, *stage.nodes] for stage in plan.stages]
     recorded = json.dumps(
         {"choices": asdict(choices), "stages": stages, **({} if undoes is None else {"undoes": undoes})}
+        | ({"origin": origin} if origin else {})
     )
     changing = plan.of(Verdict.CHANGE)
     names = [node.node for node in changing]
@@ -226,7 +231,13 @@ def execute_plan(
         save_before(opened, run, changing, replaced_by(prepared))
         run.outcomes.update(execute_direct(opened, run, prepared, rate=rate))
         on_outcomes(run.outcomes)
-    raise print_totals(opened, run, as_json=as_json, retry=retry_hint(command, undoes))
+    raise print_totals(opened, run, as_json=as_json, retry=bench_retry(origin, plan) or retry_hint(command, undoes))
+
+
+def bench_retry(origin: str, plan: Plan) -> str:
+    """The way to finish a resumed bootstrap whose nodes are all unreachable, in place of another `meshctl resume`."""
+    away = [node.node for node in plan.of(Verdict.AWAY)]
+    return f"run `meshctl bootstrap {' '.join(away)}`" if origin == "bootstrap" and len(away) == len(plan.nodes) else ""
 
 
 def execute_direct(opened: Session, run: JournaledRun, prepared: Prepared, *, rate: float | None) -> dict[str, Outcome]:

@@ -157,6 +157,7 @@ class RobotsContext:
         self, command: str, work: Callable[[RobotsContext], RobotTask], parameters: Mapping[str, object] | None = None
     ) -> JournaledRun:
         """`run_on_each` with progress and a journal entry `robots COMMAND`; `parameters` serve `meshctl resume`."""
+        self.connector.require_a_computer(self.robots)
         plan = json.dumps({"robots": dict(parameters or {})})
         with journaled_run(self.opened, f"robots {command}", self.robots, plan=plan, as_json=self.as_json) as journaled:
 

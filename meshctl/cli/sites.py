@@ -220,6 +220,7 @@ def trust_command(
     inventory: InventoryPath = Path(),
     change: Annotated[bool, typer.Option("--replace", help="Also accept changed keys.")] = False,
     yes: Annotated[bool, typer.Option("--yes", "-y", help="Pin without confirmation.")] = False,
+    dry_run: DryRun = False,
     key: KeyFiles = None,
     lab: Lab = None,
 ) -> None:
@@ -227,22 +228,32 @@ def trust_command(
 
     Example: meshctl sites trust north
     """
-    with session(inventory, key_files=key or (), lab=lab) as opened:
+    with session(inventory, key_files=key or (), lab=lab, changes_nothing=dry_run) as opened:
         results = [
-            _pin(opened, site, may_replace=change, yes=yes) for site in selected_sites(opened, sites, with_login=True)
+            _pin(opened, site, may_replace=change, yes=yes, dry_run=dry_run)
+            for site in selected_sites(opened, sites, with_login=True)
         ]
     if not all(results):
         raise typer.Exit(ExitCode.FINDINGS)
 
 
-def _pin(opened: Session, site: Site, *, may_replace: bool, yes: bool) -> bool:
+def _pin(opened: Session, site: Site, *, may_replace: bool, yes: bool, dry_run: bool) -> bool:
     try:
         shown = _presented_key(opened, site)
     except MeshctlError as error:
         echo(f"{site.name}: {error}" + (f"\n  hint: {error.hint}" if error.hint else ""))
         return False
     name = f"{PIN_PREFIX}{site.name}"
-    return pin_host_key(opened.trust, name, shown, label=site.name, device="gateway", may_replace=may_replace, yes=yes)
+    return pin_host_key(
+        opened.trust,
+        name,
+        shown,
+        label=site.name,
+        device="gateway",
+        may_replace=may_replace,
+        yes=yes,
+        dry_run=dry_run,
+    )
 
 
 def _presented_key(opened: Session, site: Site) -> HostKey:

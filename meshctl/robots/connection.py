@@ -6,7 +6,7 @@ Host keys are pinned in the fleet's known_hosts as `robot.NAME`, since a node ma
 from __future__ import annotations
 
 import socket
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 
@@ -53,6 +53,16 @@ class RobotConnector:
         host = computer.ssh.host or str(computer.address.ip)
         user = computer.ssh.user or local_user(f"robots.{robot}.computer.ssh.user")
         return Endpoint(host, computer.ssh.port, user, identity=f"robot.{robot}")
+
+    def require_a_computer(self, robots: Sequence[str]) -> None:
+        """Raises InputError if the lab has no computer of any of these robots, so that a run could only fail."""
+        if not self.lab or not robots or any(computer_of(self.fleet, robot).ssh.host for robot in robots):
+            return
+        raise InputError(
+            f"the lab in {self.lab} has no computers to log in to, and the inventory's addresses of "
+            f"{', '.join(robots)} may be those of the real robots",
+            hint=f"set robots.{robots[0]}.computer.ssh.host to a test machine, or unset MESHCTL_LAB",
+        )
 
     @contextmanager
     def host(

@@ -112,6 +112,8 @@ def test_the_command_for_what_a_run_left_is_one_that_takes_the_run_up() -> None:
     assert retry_hint("provision") == "run `meshctl resume`"
     # `meshctl resume` refuses these
     assert retry_hint("rollback", undoes=4) == "run `meshctl rollback 4`"
+    # it uses the inventory's addresses, which devices do not have before their first change is confirmed
+    assert retry_hint("bootstrap") == "repeat the same `meshctl bootstrap`"
     assert retry_hint("restore") == "repeat the same `meshctl restore`"
 
 

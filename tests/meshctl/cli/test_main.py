@@ -124,14 +124,25 @@ def _leaves(command: Any, words: tuple[str, ...]) -> Iterator[tuple[str, Any]]:
         yield " ".join(words), command
 
 
-def test_every_command_that_reads_an_inventory_takes_it_as_an_option() -> None:
+def _options() -> dict[str, set[str]]:
     options: dict[str, set[str]] = {}
     for name in COMMANDS:
         group: Any = typer.main.get_command(root.build(name))
         for words, command in _leaves(group.commands[name], (name,)):
             options[words] = {option for parameter in command.params for option in parameter.opts}
-    lacking = {words for words, found in options.items() if not {"--inventory", "-i"} <= found}
+    return options
+
+
+def test_every_command_that_reads_an_inventory_takes_it_as_an_option() -> None:
+    lacking = {words for words, found in _options().items() if not {"--inventory", "-i"} <= found}
     assert lacking == WITHOUT_INVENTORY
+
+
+def test_every_command_that_asks_before_a_change_has_a_dry_run() -> None:
+    # preflight asks before it sends an emergency stop, and changes nothing
+    assert {words for words, found in _options().items() if "--yes" in found and "--dry-run" not in found} == {
+        "preflight"
+    }
 
 
 def test_completion_offers_the_commands(tmp_path: Path) -> None:

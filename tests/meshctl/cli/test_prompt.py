@@ -11,8 +11,8 @@ import pytest
 from meshctl.cli.main import main
 from meshctl.cli.output import console
 from meshctl.cli.plan import bench_advice
+from meshctl.cli.plan_execution import bench_retry
 from meshctl.device.framing import command_line
-from meshctl.fleet.journal import RunRecord
 from meshctl.plan import NodePlan, Plan, Verdict
 
 
@@ -22,10 +22,6 @@ class Terminal(io.StringIO):
 
 
 STYLES = re.compile(r"\x1b\[[0-9;]*m")
-
-
-def run_of(command: str) -> RunRecord:
-    return RunRecord(7, command, "f", "/x", "me", "p", "", 0.0, 1.0, "1 unreachable")
 
 
 @pytest.mark.parametrize("words", [["--help"], ["plan", "--help"], ["robots", "deploy", "--help"], ["plan", "--nope"]])
@@ -66,13 +62,22 @@ def test_a_single_argument_is_passed_to_the_shell_and_several_are_quoted(command
 def test_a_resumed_bootstrap_advises_connecting_unreachable_nodes_on_the_bench() -> None:
     nodes = {"b01": NodePlan("b01", Verdict.AWAY, reason="no answer"), "b02": NodePlan("b02", Verdict.SAME)}
     plan = Plan("f", 0.0, ("base",), nodes)
-    assert bench_advice(run_of("bootstrap"), plan) == (
+    assert bench_advice(7, "bootstrap", plan) == (
         "run 7 was a bootstrap: b01 may still have factory defaults",
         "hint: connect such a device on the bench and run `meshctl bootstrap` again",
     )
     same = Plan("f", 0.0, ("base",), {"b02": nodes["b02"]})
-    assert bench_advice(run_of("replace"), same) == (
+    assert bench_advice(7, "replace", same) == (
         "hint: run the same `meshctl replace b02 NEW` again to record it in the inventory",
     )
-    assert bench_advice(run_of("provision"), plan) == ()
-    assert bench_advice(run_of("bootstrap"), same) == ()
+    assert bench_advice(7, "provision", plan) == ()
+    assert bench_advice(7, "bootstrap", same) == ()
+
+
+def test_a_resumed_bootstrap_without_any_reachable_node_advises_bootstrap_and_not_another_resume() -> None:
+    away = {name: NodePlan(name, Verdict.AWAY, reason="no answer") for name in ("b01", "b02")}
+    plan = Plan("f", 0.0, ("base",), away)
+    assert bench_retry("bootstrap", plan) == "run `meshctl bootstrap b01 b02`"
+    assert bench_retry("provision", plan) == ""
+    some = Plan("f", 0.0, ("base",), {**away, "b03": NodePlan("b03", Verdict.CHANGE)})
+    assert bench_retry("bootstrap", some) == ""
