@@ -18,6 +18,7 @@ from meshctl.lint.rules import (
     computers,
     drivers,
     encryption,
+    extra_addresses,
     extra_dhcp,
     extra_firewall,
     extra_interfaces,
@@ -106,6 +107,7 @@ CHAPTERS: tuple[tuple[str, ModuleType], ...] = (
     ("Further interfaces", extra_interfaces),
     ("Further address servers", extra_dhcp),
     ("Further firewall zones", extra_firewall),
+    ("Further addresses", extra_addresses),
 )
 
 

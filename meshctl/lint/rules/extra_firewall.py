@@ -1,4 +1,4 @@
-"""Firewall zones of extra_uci that take over the management network (MC929)."""
+"""Firewall zones of extra_uci: those that take over the management network, and open uplinks (MC929 to MC930)."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ from meshctl.lint.rules.rendering import created_sections, with_extra
 from meshctl.model import Fleet
 from meshctl.uci import Package, Section
 
+# of netifd and its packages; tunnels such as wireguard are not among them, since both ends may be the team's
+_UPLINK_PROTOCOLS = ("dhcp", "dhcpv6", "pppoe", "pppoa", "pptp", "3g", "qmi", "mbim", "ncm", "modemmanager", "dslite")
 _UPLINK = """
     nodes: {b01: {extra_uci: {network.wan: interface, network.wan.proto: dhcp, network.wan.device: eth1,
       firewall.wan: zone, firewall.wan.name: wan, firewall.wan.network: wan, firewall.wan.input: REJECT,
@@ -40,6 +42,55 @@ def zone_taken(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
                 for keys, message, expected, found in _shared(name, zone, own, packages):
                     key = next((key for key in keys if key in node.extra_uci), f"firewall.{name}")
                     yield Finding(("nodes", node.name, "extra_uci", key), message, expected, found)
+
+
+@fleet_rule(
+    "MC930",
+    Severity.WARNING,
+    "The firewall is open toward an uplink",
+    why="""What is beyond an uplink is not the team's: the internet, a provider's or a client's network. With
+    `input: ACCEPT`, or without a policy where the default is that, everyone there reaches the node's SSH, name and web
+    servers; a forwarding from the uplink's zone leads to all radios and robots.""",
+    fix="""Set `input: REJECT` for the uplink's zone, remove the forwarding, and open single ports with a `rule`.
+    Answers to the node's own connections pass in any case. If the uplink is a trusted network, suppress this finding
+    with that reason.""",
+    failing=_UPLINK.replace("REJECT", "ACCEPT"),
+    passing=_UPLINK,
+)
+def uplink_open(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
+    for node, packages in with_extra(fleet, context):
+        uplinks = {name for name, section in created_sections(node, packages, "network") if _is_uplink(section)}
+        firewall = packages.get("firewall")
+        if firewall is None or not uplinks:
+            continue
+        default = next((section.get("input") for section in firewall.of_type("defaults")), "")
+        outer = set()
+        for zone in firewall.of_type("zone"):
+            inside = [name for name in zone.get("network").split() if name in uplinks]
+            outer |= {zone.get("name")} if inside else set()
+            policy = zone.get("input") or default
+            if inside and policy.upper() == "ACCEPT":
+                own = f"firewall.{zone.name}"
+                keys = (f"{own}.input", f"{own}.network", own)
+                key = next((key for key in keys if key in node.extra_uci), f"network.{inside[0]}")
+                message = f"everyone beyond {', '.join(inside)} reaches this node's servers"
+                yield Finding(("nodes", node.name, "extra_uci", key), message, "input REJECT", f"input {policy}")
+        for name, forwarding in created_sections(node, packages, "firewall"):
+            source, dest = forwarding.get("src"), forwarding.get("dest")
+            if forwarding.type == "forwarding" and source in outer and dest and dest not in outer:
+                key = f"firewall.{name}.src" if f"firewall.{name}.src" in node.extra_uci else f"firewall.{name}"
+                message = f"everyone beyond {source} reaches what is in {dest}"
+                yield Finding(
+                    ("nodes", node.name, "extra_uci", key), message, f"src {dest}, dest {source}", f"src {source}"
+                )
+
+
+def _is_uplink(interface: Section) -> bool:
+    """Whether another network gives the interface its address, or it leads to a gateway."""
+    if interface.type != "interface":
+        return False
+    proto = interface.get("proto")
+    return proto in _UPLINK_PROTOCOLS or (proto == "static" and bool(interface.get("gateway")))
 
 
 def _shared(

@@ -19,6 +19,8 @@ _Check = Callable[[str], tuple[str, str] | None]
 
 _MAX_SSID_BYTES = 32
 _MAX_VLAN = 4094
+# dnsmasq and odhcpd make a shorter lease this long
+_MIN_LEASE_S = 120
 _UNIQUE_LOCAL = IPv6Network("fc00::/7")
 # OpenWrt's wifi scripts look for these in the value
 _METHODS = ("psk", "sae", "owe", "wpa", "wep", "8021x")
@@ -61,6 +63,8 @@ def _mac(value: str) -> tuple[str, str] | None:
 
 
 def _lease_time(value: str) -> tuple[str, str] | None:
+    if value.isascii() and value.isdecimal() and int(value) < _MIN_LEASE_S:
+        return f"a time with its unit, such as {value}h", "a number alone is seconds; a lease has 2 minutes at least"
     return None if _LEASE_TIME.fullmatch(value) else ("a time such as 30m, 12h or infinite", "")
 
 

@@ -117,3 +117,68 @@ def test_an_address_without_its_netmask_is_one_finding(tmp_path: Path) -> None:
     """MC928 said "not in 172.20.0.1/32: expected 1 to -1"."""
     findings = _found({"network.office.netmask": None}, tmp_path)
     assert [one.code for one in findings] == ["MC924"]
+
+
+_FORWARDING = {"firewall.inward": "forwarding", "firewall.inward.src": "wan", "firewall.inward.dest": "management"}
+
+
+@pytest.mark.parametrize(
+    ("changes", "key", "found"),
+    [
+        ({"firewall.wan.input": "ACCEPT"}, "firewall.wan.input", "input ACCEPT"),
+        ({"firewall.wan.input": None, "firewall.@defaults[0].input": "ACCEPT"}, "firewall.wan.network", "input ACCEPT"),
+        (
+            {
+                "network.wan.proto": "static",
+                "network.wan.ipaddr": "192.0.2.7/24",
+                "network.wan.gateway": "192.0.2.1",
+                "firewall.wan.input": "ACCEPT",
+            },
+            "firewall.wan.input",
+            "input ACCEPT",
+        ),
+        (_FORWARDING, "firewall.inward.src", "src wan"),
+        ({"firewall.management.network": "lan wan"}, "firewall.management.network", "input ACCEPT"),
+    ],
+)
+def test_a_firewall_that_is_open_toward_an_uplink_is_reported(
+    changes: dict[str, str | None], key: str, found: str, tmp_path: Path
+) -> None:
+    findings = [one for one in _found(changes, tmp_path) if one.code == "MC930"]
+    assert [(one.path, one.found) for one in findings] == [(f"nodes.b01.extra_uci.{key}", found)]
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        # the office is the team's own network, and so may be a tunnel's other end
+        {"firewall.office": "zone", "firewall.office.name": "office", "firewall.office.network": "office",
+         "firewall.office.input": "ACCEPT"},
+        {"network.wan.proto": "wireguard", "network.wan.device": None, "firewall.wan.input": "ACCEPT"},
+        {**_FORWARDING, "firewall.inward.src": "management", "firewall.inward.dest": "wan"},
+        {"firewall.wan.input": None},
+    ],
+)  # fmt: skip
+def test_a_firewall_that_is_closed_toward_its_uplink_is_sound(changes: dict[str, str | None], tmp_path: Path) -> None:
+    assert [one for one in _found(changes, tmp_path) if one.code == "MC930"] == []
+
+
+@pytest.mark.parametrize(
+    ("address", "netmask", "codes"),
+    [
+        ("172.20.0.0", "255.255.255.0", ["MC931"]),
+        ("172.20.0.255", "255.255.255.0", ["MC931"]),
+        ("172.20.0.0/31", None, []),
+        ("172.20.0.255", "255.255.0.0", []),
+    ],
+)
+def test_the_address_of_a_network_is_no_interface_s(
+    address: str, netmask: str | None, codes: list[str], tmp_path: Path
+) -> None:
+    changes = {"network.office.ipaddr": address, "network.office.netmask": netmask}
+    assert [one.code for one in _found(changes, tmp_path) if one.code == "MC931"] == codes
+
+
+@pytest.mark.parametrize(("time", "codes"), [("12", ["MC918"]), ("0", ["MC918"]), ("43200", []), ("12h", [])])
+def test_a_lease_of_seconds_is_reported(time: str, codes: list[str], tmp_path: Path) -> None:
+    assert [one.code for one in _found({"dhcp.office.leasetime": time}, tmp_path)] == codes
