@@ -8,7 +8,7 @@ from ipaddress import IPv4Address, ip_address
 
 from meshctl.diagnostics import Position, Severity
 from meshctl.lint.context import LintContext
-from meshctl.lint.grouping import duplicates
+from meshctl.lint.grouping import duplicates, overlaps
 from meshctl.lint.places import first_written
 from meshctl.lint.rule import Finding, fleet_rule
 from meshctl.model import Fleet, Mesh, Node
@@ -152,6 +152,12 @@ def wrong_networks(fleet: Fleet) -> frozenset[str]:
     )
 
 
+def overlapping_meshes(fleet: Fleet) -> frozenset[str]:
+    """Meshes whose networks overlap, but differ: MC205 reports them, and findings about addresses there follow."""
+    pairs = overlaps((mesh, mesh.network) for mesh in fleet.meshes.values())
+    return frozenset(name for (mesh, one), (other, two) in pairs if one != two for name in (mesh.name, other.name))
+
+
 @fleet_rule(
     "MC203",
     Severity.ERROR,
@@ -188,14 +194,17 @@ def _reserved(path: tuple[str, ...], address: IpInterface) -> Iterator[Finding]:
     why="The kernel rejects a gateway outside the node's network; a node that is its own gateway sends nothing.",
     fix="Use the address of another station in the same network.",
     failing="nodes: {b01: {gateway: 10.99.0.1}}",
-    passing="nodes: {b01: {gateway: 10.42.0.254}}",
+    passing="nodes: {b01: {gateway: 10.42.0.100}}",
 )
 def gateway_unreachable(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    unclear = overlapping_meshes(fleet)
     for node in fleet.managed():
         if node.gateway is None:
             continue
         own = [address for address in (node.address, node.lan_address) if address is not None]
         is_itself = any(node.gateway == address.ip for address in own)
+        if not is_itself and unclear.intersection(node.meshes):
+            continue
         if is_itself or not any(node.gateway in address.network for address in own):
             message = "it is the node's own address" if is_itself else "not reachable from the node"
             expected = f"another station in {' or '.join(str(address.network) for address in own)}"

@@ -35,7 +35,7 @@ _DRIVERS = frozenset(
 _PCI_BUS = re.compile(r"pci[0-9a-f]{4}:[0-9a-f]{2}")
 _PCI_SLOT = re.compile(r"[0-9a-f]{4}:[0-9a-f]{2}:[0-9a-f]{2}\.[0-7](\+\d+)?")
 _LIKE_PCI_BUS = re.compile(r"[a-z]*[0-9a-f]{4}:[0-9a-f]{2}")
-_LIKE_PCI_SLOT = re.compile(r"[0-9a-z]+:[0-9a-z:]+\.[0-9+]+")
+_LIKE_PCI_SLOT = re.compile(r"[0-9a-z]+:[0-9a-z:]+\.[0-9+]+|[0-9a-f]+:[0-9a-f]+:[0-9a-f]+")
 # `mt76` and `rtw8` begin several drivers; shorter names begin too many
 _MIN_FAMILY_LETTERS = 4
 _MODE_NAMES = {MeshMode.ADHOC: "ad-hoc", MeshMode.MESH: "802.11s"}
@@ -145,7 +145,9 @@ def path_of_no_device(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
 def _is_device_path(path: str) -> bool:
     """Whether it names a device below a bus, and its PCI buses and slots have the kernel's form."""
     parts = path.split("/")
-    return len(parts) > 1 and all(parts) and not re.search(r"\s", path) and not any(_is_bad_pci(part) for part in parts)
+    is_plausible = len(parts) > 1 and all(parts) and not re.search(r"\s", path)
+    # the device is behind its bus
+    return is_plausible and not _PCI_BUS.fullmatch(parts[-1]) and not any(_is_bad_pci(part) for part in parts)
 
 
 def _is_bad_pci(part: str) -> bool:

@@ -20,6 +20,8 @@ from meshctl.wording import join_limited
 
 # one label of a host name: RFC 1123 section 2.1 and RFC 952, at most 63 octets (RFC 1035 section 2.3.4)
 _LABEL = re.compile(r"[A-Za-z0-9]([A-Za-z0-9-]{0,61}[A-Za-z0-9])?")
+# so many names of robots that are also unrelated nodes' are one scheme of names, not as many mistakes
+_SINGLE_NAMES = 2
 _MAC = re.compile(r"[0-9a-f]{2}(:[0-9a-f]{2}){5}")
 
 
@@ -310,9 +312,13 @@ def _pins(fleet: Fleet, context: LintContext) -> tuple[Pin, ...] | None:
     """,
 )
 def robot_and_node_share_name(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    for name, robot in fleet.robots.items():
-        if name in fleet.nodes and name not in robot.nodes:
-            yield Finding(("robots", name), "an unrelated node has the same name", "another name", name)
+    shared = [name for name, robot in fleet.robots.items() if name in fleet.nodes and name not in robot.nodes]
+    if len(shared) > _SINGLE_NAMES:
+        # robots and radios with one scheme of names
+        yield Finding(("robots", shared[0]), "unrelated nodes have the same names", "other names", join_limited(shared))
+        return
+    for name in shared:
+        yield Finding(("robots", name), "an unrelated node has the same name", "another name", name)
 
 
 @fleet_rule(

@@ -9,7 +9,7 @@ from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
 from meshctl.lint.grouping import group_by_key, overlaps
 from meshctl.lint.rule import Finding, fleet_rule
-from meshctl.lint.rules.addresses import meshes_of, networks, stations, wrong_networks
+from meshctl.lint.rules.addresses import meshes_of, networks, overlapping_meshes, stations, wrong_networks
 from meshctl.lint.rules.team import reached_from_base
 from meshctl.model import Backend, Fleet, Mesh, Role
 from meshctl.model.ip import IpAddress, IpInterface, IpNetwork
@@ -221,8 +221,11 @@ def network_full(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     passing="nodes: {b01: {address: 10.42.0.7}}",
 )
 def node_prefix_differs(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    unclear = overlapping_meshes(fleet)
     for node in fleet.managed():
         holding = [mesh for mesh in meshes_of(fleet, node) if node.address.ip in mesh.network]
+        if unclear.intersection(node.meshes):
+            continue
         if holding and not any(node.address.network == mesh.network for mesh in holding):
             expected = f"/{holding[0].network.prefixlen} as in mesh {holding[0].name}"
             path = ("nodes", node.name, "address")

@@ -1,4 +1,4 @@
-"""Fixed positions of radios and robots (MC641 to MC642)."""
+"""Fixed positions of radios and robots (MC641 to MC643)."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ from meshctl.wording import join_limited
 
 # Directional links of hundreds of kilometers exist as records; a mesh's are shorter than this.
 MAX_LINK_M = 100_000.0
+# a single node so many times as far away as can be is at a wrong position; otherwise the distance may be too short
+_MISPLACED = 4
 
 
 def _nodes(fleet: Fleet) -> dict[str, FixedPosition]:
@@ -89,3 +91,70 @@ def _reaches(ordered: list[tuple[str, FixedPosition]], index: int, step: int, pl
             return True
         other += step
     return False
+
+
+@fleet_rule(
+    "MC643",
+    Severity.WARNING,
+    "Nodes of a mesh are farther apart than its longest link",
+    why="""`distance_m` is the length of the longest link: radios wait for an acknowledgment as long as it takes over
+    this distance. Over a longer link each frame is sent again until it is given up, although it arrived. Either the
+    distance is too short, or a position is wrong. Nodes without a position may stand in between; each of them is
+    counted as another link.""",
+    fix="Correct the position, or set `distance_m` of the mesh to the length of the longest link.",
+    failing="""
+    nodes: {b01: {position: {x_m: 10, y_m: 20}}, base: {position: {x_m: 40000, y_m: 20}}}
+    """,
+    passing="""
+    nodes: {b01: {position: {x_m: 10, y_m: 20}}, base: {position: {x_m: 1800, y_m: 20}}}
+    """,
+)
+def apart_for_distance(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for mesh in fleet.meshes.values():
+        members = [node for node in fleet.managed() if mesh.name in node.meshes]
+        placed = [(node.name, node.position) for node in members if node.position is not None]
+        reach_m = mesh.distance_m * (len(members) - len(placed) + 1)
+        gaps = _gaps(placed, reach_m) if mesh.distance_m else []
+        for gap_m, cluster, (near, far) in gaps:
+            is_misplaced = len(cluster) == 1 < len(placed) - 1 and gap_m > _MISPLACED * reach_m
+            if gap_m > MAX_LINK_M and len(cluster) == 1:
+                continue  # MC642 reports it
+            path = ("nodes", cluster[0], "position") if is_misplaced else ("meshes", mesh.name, "distance_m")
+            message = f"{near} and {far} are {gap_m / 1000:.1f} km apart, and no other node is between them"
+            if len(members) > len(placed):
+                message = f"{near} and {far} are {gap_m / 1000:.1f} km apart, too far for the nodes without a position"
+            yield Finding(path, message, f"links of at most distance_m of mesh {mesh.name}", f"{mesh.distance_m} m")
+            if not is_misplaced:
+                break  # the distance is too short for all of them
+
+
+_Placed = list[tuple[str, FixedPosition]]
+
+
+def _gaps(placed: _Placed, reach_m: float) -> list[tuple[float, list[str], tuple[str, str]]]:
+    """The clusters of nodes within reach of each other, but for the largest: the distance to the nearest other
+    cluster, the nodes, and the two nodes nearest to each other; the widest gap first."""
+    left, clusters = dict(placed), []
+    while left:
+        cluster = [left.popitem()]
+        # grows while it is read
+        for _, place in cluster:
+            within = [(name, there) for name, there in left.items() if _apart_m(place, there) <= reach_m]
+            for name, _ in within:
+                del left[name]
+            cluster += within
+        clusters.append(cluster)
+    clusters.sort(key=len)
+    found = []
+    for cluster in clusters[:-1]:
+        inside = {name for name, _ in cluster}
+        outside = [item for item in placed if item[0] not in inside]
+        gap_m, near, far = min(
+            (_apart_m(place, there), name, other) for name, place in cluster for other, there in outside
+        )
+        found.append((gap_m, [name for name, _ in cluster], (near, far)))
+    return sorted(found, reverse=True)
+
+
+def _apart_m(place: FixedPosition, there: FixedPosition) -> float:
+    return math.hypot(there.x_m - place.x_m, there.y_m - place.y_m)

@@ -1,4 +1,4 @@
-"""Where the nodes' default routes and batman-adv's clients lead (MC223 to MC224)."""
+"""Where the nodes' default routes and batman-adv's clients lead (MC223 to MC225)."""
 
 from __future__ import annotations
 
@@ -7,9 +7,12 @@ from pathlib import Path
 
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
+from meshctl.lint.grouping import group_by_key
 from meshctl.lint.rule import Finding, fleet_rule
+from meshctl.lint.rules.addresses import as_address, stations
 from meshctl.model import Fleet, Node
 from meshctl.model.ip import IpAddress
+from meshctl.wording import join_limited
 
 
 @fleet_rule(
@@ -83,3 +86,29 @@ def clients_without_gateway(fleet: Fleet, _context: LintContext) -> Iterator[Fin
         if mesh.batman.gw_mode == "client" and mesh.network not in serving:
             path = ("meshes", mesh.name, "batman", "gw_mode")
             yield Finding(path, "no node of the mesh is a gateway", "a node with gw_mode server", "clients only")
+
+
+@fleet_rule(
+    "MC225",
+    Severity.NOTE,
+    "A gateway has the address of no station in the inventory",
+    why="""Packets to other networks go to this address. If no router there has it, and it was mistyped, the nodes
+    reach no time server and no server beyond the mesh, and no command says so.""",
+    fix="""Use the address of the node with the uplink. For a router that is not in the inventory, suppress this finding
+    with its name.""",
+    failing="nodes: {b01: {gateway: 10.42.0.254}}",
+    passing="nodes: {b01: {gateway: 10.42.0.100}}",
+)
+def gateway_not_a_station(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    # MC223 reports a gateway that is not in use; a site's gateway may be the router
+    known = {address for address, _ in stations(fleet)} | {node.address.ip for node in fleet.nodes.values()}
+    known |= {address for site in fleet.sites.values() if (address := as_address(site.ssh.host)) is not None}
+    using = group_by_key((node.gateway, node) for node in fleet.managed() if node.gateway is not None)
+    for gateway, nodes in using.items():
+        # MC204 reports one that is not in the node's network
+        own = [address for node in nodes for address in (node.address, node.lan_address) if address is not None]
+        if gateway in known or not any(gateway in address.network for address in own):
+            continue
+        path = ("nodes", nodes[0].name, "gateway")
+        message = f"{join_limited([node.name for node in nodes])}: no station in the inventory has this address"
+        yield Finding(path, message, "the address of a node with an uplink", str(gateway))

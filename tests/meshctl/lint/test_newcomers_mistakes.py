@@ -164,3 +164,80 @@ def test_a_name_of_the_inventory_is_no_host_name(key: str, tmp_path: Path) -> No
     fragment = f"system: {{{key}}}\nnodes: {{b01: {{gateway: 10.42.0.254}}}}"
     (finding,) = [one for one in _found(fragment, tmp_path) if one.code == "MC235"]
     assert (finding.expected, finding.found) == ("10.42.0.100", "base-station")
+
+
+def _gateways(nodes: str, directory: Path) -> list[tuple[str, str]]:
+    example = Example(nodes)
+    found = check_path(write(example, directory), _REGDB, environment(example)).diagnostics
+    return [(one.path, one.message) for one in found if one.code == "MC225"]
+
+
+@pytest.mark.parametrize("gateway", ["10.42.0.100", "10.42.0.1"])
+def test_a_gateway_in_the_inventory_is_known(gateway: str, tmp_path: Path) -> None:
+    assert _gateways(f"nodes: {{b01: {{gateway: {gateway}}}}}", tmp_path) == []
+
+
+def test_an_unknown_gateway_is_one_note_for_all_its_nodes(tmp_path: Path) -> None:
+    message = "base, husky1-front, b01: no station in the inventory has this address"
+    assert _gateways("defaults: {gateway: 10.42.0.254}", tmp_path) == [("nodes.base.gateway", message)]
+    # MC204 and MC223 report these
+    (tmp_path / "other").mkdir()
+    nodes = "nodes: {b01: {gateway: 10.99.0.1}, husky1-front: {gateway: 10.42.0.1}, base: {state: lost}}"
+    assert _gateways(nodes, tmp_path / "other") == []
+
+
+_ROW = "".join(f"  a{number}: {{position: {{x_m: {number * 900}, y_m: 0}}}}\n" for number in range(1, 5))
+_IN_A_ROW = 'nodes:\n  "a[1-4]": {role: beacon, hardware: rocket, address: {from: 10.42.0.201}}\n' + _ROW
+
+
+@pytest.mark.parametrize(
+    ("more", "path"),
+    [
+        ("  b01: {position: {x_m: 4500, y_m: 0}}\n", None),
+        # two nodes without a position may stand between them
+        ("  b01: {position: {x_m: 6500, y_m: 0}}\n", None),
+        ("  b01: {position: {x_m: 6700, y_m: 0}}\n", "meshes.main.distance_m"),
+        ("  b01: {position: {x_m: 44000, y_m: 0}}\n", "nodes.b01.position"),
+        ("  b01: {position: {x_m: 300000, y_m: 0}}\n", None),
+        ("meshes: {main: {distance_m: 0}}\n", None),
+        ("meshes: {main: {distance_m: 200}}\n", "meshes.main.distance_m"),
+    ],
+)
+def test_nodes_that_are_farther_apart_than_the_longest_link(more: str, path: str | None, tmp_path: Path) -> None:
+    found = [one.path for one in _found(_IN_A_ROW + more, tmp_path) if one.code == "MC643"]
+    assert found == ([] if path is None else [path])
+
+
+@pytest.mark.parametrize(
+    ("path", "codes"),
+    [
+        ("pci0000:00/0000:00:00", ["MC843"]),
+        ("pci0000:00", ["MC843"]),
+        ("1e140000.pcie/pci0000:00/0000:00:01.0/0000:02:00", ["MC843"]),
+        ("pci0000:00/0000:00:00.0", []),
+        ("pci0000:00/0000:00:00.0/usb1/1-1/1-1:1.0", []),
+    ],
+)
+def test_a_pci_device_has_a_function(path: str, codes: list[str], tmp_path: Path) -> None:
+    found = _found(f"hardware: {{rocket: {{radios: {{radio0: {{path: '{path}'}}}}}}}}", tmp_path)
+    assert [one.code for one in found if one.code == "MC843"] == codes
+
+
+def test_overlapping_networks_of_two_meshes_are_one_finding(tmp_path: Path) -> None:
+    """Each node's prefix (MC215) and gateway (MC204) were reported, too."""
+    fragment = """
+    meshes:
+      second: {ssid: second, bssid: "02:ca:fe:00:00:02", band: 5g, channel: 149, network: 10.42.0.0/23,
+               encryption: psk2+ccmp, key: {env: MESH_KEY}}
+    defaults: {gateway: 10.42.1.254}
+    nodes: {base: {radios: {radio1: {mesh: second}}}, husky1-front: {address: 10.42.0.11/23}}
+    """
+    found = [one.code for one in _found(fragment, tmp_path) if one.code.startswith("MC2")]
+    assert (found.count("MC205"), {"MC204", "MC215"} & {*found}) == (1, set())
+
+
+def test_radios_with_the_names_of_robots_are_one_finding(tmp_path: Path) -> None:
+    nodes = 'nodes: {"r[1-5]-radio": {role: robot, hardware: rocket, address: {from: 10.42.0.201}}, '
+    nodes += '"r[1-5]": {role: beacon, hardware: rocket, address: {from: 10.42.0.211}}}\nrobots:\n'
+    (finding,) = [one for one in _found(nodes + _ROBOTS, tmp_path) if one.code == "MC120"]
+    assert (finding.path, finding.found) == ("robots.r1", "r1, r2, r3, r4 and 1 more")
