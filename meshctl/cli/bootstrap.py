@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import secrets
+import time
 from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import replace as with_changes
@@ -61,6 +62,7 @@ from meshctl.errors import ExitCode, InputError, MeshctlError, NodeError
 from meshctl.fleet import Outcome, Result
 from meshctl.inventory.edit import Editor, FileEdit, save, set_node
 from meshctl.model import Fleet, Node, NodeState
+from meshctl.nodes.former_devices import facts_of_former_device
 from meshctl.nodes.slots import transfers_at_once
 from meshctl.plan import Verdict
 from meshctl.report.progress import outcome_text
@@ -227,6 +229,7 @@ def replace(
     with session(inventory, key_files=key or (), lab=lab, changes_nothing=dry_run) as opened:
         old_node = _replaced(opened.fleet, old)
         spare = _spare(opened, old_node, new)
+        former = facts_of_former_device(old_node, opened.journal.last_known(opened.fleet.name))
         has_taken_over = not old_is_off and _require_off(opened, inventory, old_node, spare)
         given = _given_places(opened, [at] if at else [], [interface] if interface else [], at_site)
         if spare is None and not given and opened.lab is not None:
@@ -286,6 +289,8 @@ def replace(
         # not by the exit code: after Ctrl-C the device may have taken over, too
         has_succeeded = status == ExitCode.OK if dry_run else ended[node.name].result.is_good
         if has_succeeded:
+            if former[1] and not (dry_run or has_taken_over):
+                opened.journal.remember(opened.fleet.name, *former, time.time())
             changes = _record_identity(opened, inventory, old_node, spare, successor, dry_run=dry_run)
             echo("".join(change.diff() for change in changes), nl=False, err=as_json)
         raise typer.Exit(status)

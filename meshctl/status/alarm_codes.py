@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from types import MappingProxyType
 
+FORMER_DEVICE = "former-device"
 CODES: Mapping[str, str] = MappingProxyType(
     {
         # radios and robots' computers
@@ -65,6 +66,7 @@ CODES: Mapping[str, str] = MappingProxyType(
         "computer-silent": "another computer on its switch does not answer",
         # the fleet
         "stranger": "a device that is not in the inventory is in the mesh",
+        FORMER_DEVICE: "the former device of a replaced node is in the mesh again",
         "site": "a site's worker or gateway does not answer: how old the last known state of its nodes is",
         "not-compared": "a device could not be compared with the inventory, usually because a secret is missing",
         "robots-unasked": "no robot was queried",

@@ -11,9 +11,11 @@ from dataclasses import dataclass, field, replace
 from meshctl.device.observation import Observation
 from meshctl.fleet.journal import LastKnown
 from meshctl.model import Fleet, Node, NodeState
+from meshctl.nodes.former_devices import former_devices
 from meshctl.plan import NodePlan
 from meshctl.report.duration import duration
 from meshctl.robots.facts import RobotFacts
+from meshctl.status.alarm_codes import FORMER_DEVICE
 from meshctl.status.dropped import dropped_beacons
 from meshctl.status.node_alarms import MESH_MODES, NodeAlarmInput, alarms, join_limited
 from meshctl.status.radio_facts import neighbors_of, radios_of, snr_of, temperature_of
@@ -112,8 +114,9 @@ def assess(snapshot: Snapshot, nodes: Iterable[Node], now: float, robots: Iterab
         statuses.append(_reachable_status(everything, now))
     if not snapshot.is_partial:
         statuses = _with_dropped(snapshot.fleet, statuses)
-    names = set(snapshot.macs.values()) | set(snapshot.observations) | set(snapshot.fleet.nodes)
-    strangers = tuple(name for name in snapshot.graph.nodes if name not in names)
+    names = _known_names(snapshot)
+    formers = _formers_in_mesh(snapshot)
+    strangers = tuple(name for name in snapshot.graph.nodes if name not in names | formers.keys())
     robot_answers = RobotAnswers(
         snapshot.fleet, snapshot.robots, snapshot.no_answer_robots, snapshot.known, now, frozenset(snapshot.unrendered)
     )
@@ -124,7 +127,7 @@ def assess(snapshot: Snapshot, nodes: Iterable[Node], now: float, robots: Iterab
         tuple(statuses),
         tuple(robot_status(robot_answers, snapshot.fleet.robots[name]) for name in robots),
         strangers,
-        (*_fleet_alarms(snapshot), *_site_alarms(snapshot, now)),
+        (*_fleet_alarms(snapshot), *_former_alarms(formers), *_site_alarms(snapshot, now)),
         snapshot.took_s,
     )
 
@@ -152,6 +155,23 @@ def _fleet_alarms(snapshot: Snapshot) -> Iterable[Alarm]:
         yield Alarm(Level.WARNING, "not-compared", text, hint)
     if snapshot.robots_skipped:
         yield Alarm(Level.NOTE, "robots-unasked", snapshot.robots_skipped)
+
+
+def _known_names(snapshot: Snapshot) -> set[str]:
+    return set(snapshot.macs.values()) | set(snapshot.observations) | set(snapshot.fleet.nodes)
+
+
+def _formers_in_mesh(snapshot: Snapshot) -> dict[str, str]:
+    """MAC -> the node that the device was, of each former device that is in the mesh."""
+    formers, names = former_devices(snapshot.known), _known_names(snapshot)
+    return {mac: formers[mac] for mac in snapshot.graph.nodes if mac in formers and mac not in names}
+
+
+def _former_alarms(found: Mapping[str, str]) -> Iterable[Alarm]:
+    for mac, node in found.items():
+        text = f"{mac} is in the mesh: the former device of {node}, which was replaced"
+        hint = f"switch it off, or reset it to factory defaults: it has the address and the name of {node}"
+        yield Alarm(Level.WARNING, FORMER_DEVICE, text, hint)
 
 
 def _site_alarms(snapshot: Snapshot, now: float) -> Iterable[Alarm]:
@@ -187,6 +207,10 @@ def _unreachable_status(snapshot: Snapshot, node: Node, heard_by: tuple[Sighting
         trust=f"meshctl trust {node.name}",
         first_contact_hint=f"if it is not set up yet: meshctl bootstrap {node.name}",
     )
+    if alarm is not None and why.code == "host-key" and node.name in _formers_in_mesh(snapshot).values():
+        alarm = replace(
+            alarm, hint=f"the former device of {node.name} may answer in its place: switch that one off first"
+        )
     lost_relay = lost_relay_alarm(node, why, last, now)
     found = tuple(text for text in (lost_relay, alarm) if text is not None)
     return NodeStatus(

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 from meshctl.model import Fleet, NodeState, Role
+from meshctl.status.alarm_codes import FORMER_DEVICE
 from meshctl.status.emergency_stop import DELIVERED, StopResult
 from meshctl.status.node_alarms import join_limited
 from meshctl.status.pings import Pings
@@ -220,6 +221,7 @@ def _quality(fleet: Fleet, status: FleetStatus) -> Check:
 
 def _strangers(fleet: Fleet, status: FleetStatus) -> Check:
     found = [f"{join_limited(status.strangers)} in the mesh"] if status.strangers else []
+    found += [alarm.text for alarm in status.alarms if alarm.code == FORMER_DEVICE]
     return _check("strangers", found, "none heard", _answered_radios(status))
 
 

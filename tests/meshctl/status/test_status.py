@@ -24,6 +24,7 @@ from meshctl.device.observation import (
 from meshctl.errors import ExitCode, NodeError
 from meshctl.fleet.journal import LastKnown
 from meshctl.model import Fleet, LanFilter, Role
+from meshctl.nodes.former_devices import facts_of_former_device
 from meshctl.plan import FileChange, NodePlan, Verdict
 from meshctl.status import Health
 from meshctl.status.json_output import as_json
@@ -245,6 +246,26 @@ def test_a_stranger_in_the_mesh_is_reported(fleet: Fleet) -> None:
     status = status_of(fleet, {**HEALTHY, "base": base})
     assert status.strangers == ("66:66:66:66:66:66",)
     assert status.exit_code is ExitCode.FINDINGS
+
+
+def test_the_former_device_of_a_replaced_node_is_named_as_that(fleet: Fleet) -> None:
+    """It was a MAC that is not in the inventory, with the advice to add it there."""
+    mac = "66:66:66:66:66:66"
+    key, facts = facts_of_former_device(fleet.nodes["b01"], {"b01": LastKnown("b01", NOW, {"macs": mac})})
+    stranger = MeshNeighbor(mac, "mesh0", 50)
+    base = replace(HEALTHY["base"], neighbors=(*(HEALTHY["base"].neighbors or ()), stranger))
+    status = status_of(fleet, {**HEALTHY, "base": base}, known={key: LastKnown(key, NOW, facts)})
+    (alarm,) = [alarm for alarm in status.alarms if alarm.code == "former-device"]
+    assert alarm.text == f"{mac} is in the mesh: the former device of b01, which was replaced"
+    assert status.strangers == ()
+    assert status.exit_code is ExitCode.FINDINGS
+    (check,) = [check for check in preflight(fleet, status) if check.name == "strangers"]
+    assert (check.is_go, mac in check.reason) == (False, True)
+    # it may be the one that answers at the node's address: its key must not be pinned
+    apart = {name: seen for name, seen in HEALTHY.items() if name != "b01"} | {"base": base}
+    changed = {"b01": NoAnswer("the host key changed", "host-key")}
+    status = status_of(fleet, apart, known={key: LastKnown(key, NOW, facts)}, no_answer=changed)
+    assert alarms(status, "b01")["host-key"].hint.endswith("may answer in its place: switch that one off first")
 
 
 def test_nodes_that_could_not_be_compared_are_one_alarm(fleet: Fleet) -> None:
