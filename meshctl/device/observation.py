@@ -328,6 +328,8 @@ class Observation:
     """UCI package -> the text of /etc/config/PACKAGE; contains the keys of encrypted meshes."""
     uci_changes: tuple[str, ...] | None = None
     """Uncommitted changes (`uci changes`), one line each."""
+    unconfirmed_packages: tuple[str, ...] | None = None
+    """UCI packages that rpcd restores if LuCI does not confirm a change of them in time; None if it has no snapshot."""
     authorized_keys: tuple[str, ...] | None = None
     host_keys: tuple[HostKeyInfo, ...] | None = None
     files: Mapping[str, FileInfo | None] = field(default_factory=dict, repr=False)

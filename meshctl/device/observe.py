@@ -186,6 +186,7 @@ def interpret(sections: Mapping[str, OutputSection], *, asked_at_s: float, answe
         packages=None if installed is None else MappingProxyType(installed),
         uci=_uci(reader),
         uci_changes=_lines(reader, "uci.changes"),
+        unconfirmed_packages=reader.read("uci.unconfirmed", _words, required=False),
         authorized_keys=reader.read("authorized_keys", keys.parse_authorized_keys),
         host_keys=reader.read("host_keys", keys.parse_host_keys),
         files=MappingProxyType({path: _file(reader, path) for path in reader.names("mode")}),
@@ -335,6 +336,10 @@ def _uci(reader: _OutputReader) -> Mapping[str, str] | None:
     return MappingProxyType(
         {name: body.decode("utf-8", "replace") for name, body in bodies.items() if body is not None}
     )
+
+
+def _words(text: str) -> tuple[str, ...]:
+    return tuple(text.split())
 
 
 def _lines(reader: _OutputReader, name: str) -> tuple[str, ...] | None:

@@ -145,6 +145,17 @@ def _foreign_changes(case: _Checked) -> FailedPrecondition | None:
     )
 
 
+def _unconfirmed_changes(case: _Checked) -> FailedPrecondition | None:
+    packages = case.observation.unconfirmed_packages
+    if not packages:
+        return None
+    return FailedPrecondition(
+        f"rpcd waits for the confirmation of a change to {', '.join(packages)} (LuCI: Save & Apply), and would restore "
+        f"{'it' if len(packages) == 1 else 'them'}",
+        "confirm it in LuCI, or wait until rpcd has gone back, then plan again",
+    )
+
+
 def _other_operator(case: _Checked) -> FailedPrecondition | None:
     change = case.observation.change
     if change is None:
@@ -171,5 +182,6 @@ _CHECKS: tuple[Callable[[_Checked], FailedPrecondition | None], ...] = (
     _lan_ports,
     _packages,
     _foreign_changes,
+    _unconfirmed_changes,
     _other_operator,
 )

@@ -92,6 +92,18 @@ listed_configuration() {
 	for conf in /etc/config/*; do echo "${conf##*/}"; done
 }
 
+# The packages that rpcd will restore because LuCI has applied a change that nobody has confirmed yet. A snapshot alone is no
+# sign (deadman.sh: rpcd_waits); without one, which is the rule, this is no process.
+unconfirmed() {
+	names=''
+	for file in /var/run/rpcd/snapshot-files/*; do [ ! -e "$file" ] || names="$names ${file##*/}"; done
+	[ -n "$names" ] || return 0
+	case $(ubus -t 5 call uci confirm '{"ubus_rpc_session":"meshctl"}' 2>&1) in
+	*'No response'* | *'Not found'*) return 0 ;;
+	esac
+	echo "$names"
+}
+
 package_tool() { command -v apk || command -v opkg; }
 
 # the channel in use alone: some drivers list every channel of the band
@@ -213,6 +225,7 @@ report() {
 	section package_tool package_tool
 	section packages packages
 	detail uci.changes uci changes
+	[ ! -d /var/run/rpcd/snapshot-files ] || detail uci.unconfirmed unconfirmed
 	section config.list listed_configuration
 	set -- openwrt_release /etc/openwrt_release board.json /etc/board.json meminfo /proc/meminfo
 	for conf in /etc/config/*; do

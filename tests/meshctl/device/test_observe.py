@@ -294,6 +294,21 @@ Auto-Installed: yes
 """
 
 
+@pytest.mark.parametrize(
+    ("answer", "packages"),
+    [("Permission denied", ("network", "wireless")), ("No response", ()), ("Not found", ())],
+)
+def test_a_change_that_luci_has_to_confirm_is_seen(
+    answer: str, packages: tuple[str, ...], connection: SshConnection, node: Sandbox
+) -> None:
+    """The plan said that the node would change; its dead-man's switch refused that."""
+    assert observe(connection).unconfirmed_packages is None
+    for package in ("wireless", "network"):
+        node.put(f"/var/run/rpcd/snapshot-files/{package}", "config x\n")
+    node.put("/bin/ubus", f"#!/bin/sh\n[ \"$5\" != confirm ] || {{ echo '{answer}' >&2; exit 5; }}\n", 0o755)
+    assert observe(connection).unconfirmed_packages == packages
+
+
 def test_a_brief_observation_has_what_a_proof_needs(connection: SshConnection, node: Sandbox) -> None:
     node.put("/etc/config/network", "config interface 'lan'\n")
     node.put("/usr/lib/opkg/status", OPKG_STATUS)

@@ -99,6 +99,10 @@ def test_an_unreachable_node_is_away_with_the_reason() -> None:
         ),
         ({"macs": {"lan1": "02:00:00:00:00:10"}}, "it has no port eth0: found lan1"),
         ({"uci_changes": ("network.lan.ipaddr='1.2.3.4'",)}, "it has uncommitted UCI changes"),
+        (
+            {"unconfirmed_packages": ("network", "wireless")},
+            "rpcd waits for the confirmation of a change to network, wireless (LuCI: Save & Apply)",
+        ),
         ({"packages": {"dropbear": "1"}}, "it lacks batctl-default, iw, kmod-batman-adv"),
         (
             {"change": ChangeStatus("idle", lock_owner="bob@laptop:17:4711", lock_left_s=42.0)},

@@ -60,6 +60,8 @@ def test_a_change_is_refused_while_luci_waits_and_made_once_it_has_gone_back(rig
     refused = rig.meshctl("provision", new, NAME, "--yes", "--json")
     assert refused.results == {NAME: "refused"}, refused.out + refused.err
     assert "rpcd waits for the confirmation of a change to system" in refused.out
+    planned = rig.meshctl("plan", new, NAME)
+    assert (planned.code, "rpcd waits for the confirmation of a change to system" in planned.out) == (1, True)
     await_rollback(node)
     assert rig.state_of(NAME, old, new) == "old"
     done = rig.meshctl("provision", new, NAME, "--yes", "--json")
