@@ -13,7 +13,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor, wait
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from meshctl.apply.context import RunContext
 from meshctl.apply.stale_stations import (
@@ -25,14 +25,16 @@ from meshctl.apply.stale_stations import (
     inventory_login,
     reconnect_script,
 )
+from meshctl.device.errors import Timeout
 from meshctl.device.observation import Observation
 from meshctl.device.ssh import SshConnection
-from meshctl.errors import NodeError
+from meshctl.errors import NodeError, Unreachable
 from meshctl.fleet import Event, EventKind, Interrupt, Observer, silent
 from meshctl.fleet.journal import LastKnown
 from meshctl.model import Fleet, Node
-from meshctl.nodes.collect import FleetObservation
+from meshctl.nodes.collect import FleetObservation, collect, known_macs
 from meshctl.nodes.connections import ConnectionPool
+from meshctl.nodes.slots import nodes_in_work
 from meshctl.topology import mesh_macs
 
 # A neighbor on the air sends several times a second.
@@ -107,6 +109,38 @@ def reconnect(
         return repaired(
             {name: answer.result() for name, answer in answers.items()}, asked, observed.unreachable, owners
         )
+
+
+def open_repaired(
+    connections: ConnectionPool,
+    fleet: Fleet,
+    node: Node,
+    known: Mapping[str, LastKnown],
+    *,
+    interrupt: Interrupt,
+    observer: Observer = silent,
+) -> tuple[SshConnection, tuple[str, ...]]:
+    """A connection to a node that is to be changed, and notes: if it is unreachable, once those of its mesh that hear
+    it have repaired their links to it. Raises what `ssh.connect` raises."""
+    try:
+        return connections.open(node), ()
+    except Unreachable as error:
+        is_silent = isinstance(error, Timeout) and error.is_server_silent
+        if interrupt.stopping or is_silent:
+            raise
+        observer(Event(EventKind.STEP, node.name, time.time(), "unreachable: its neighbors look at their links to it"))
+        others = [
+            other
+            for other in fleet.managed()
+            if other.name != node.name and other.site == node.site and {*other.meshes} & {*node.meshes}
+        ]
+        seen = collect(connections, others, parallel=nodes_in_work(fleet.apply.parallel), interrupt=interrupt)
+        observed = replace(seen, unreachable={node.name: str(error)})
+        done = reconnect(connections, fleet, observed, known_macs(fleet, known), interrupt=interrupt)
+        if node.name not in done.nodes or interrupt.stopping:
+            raise
+        interrupt.wait(RELEARN_S)
+    return connections.open(node), done.notes
 
 
 def _logins(node: Node, connections: ConnectionPool) -> tuple[LoginPlace, ...]:

@@ -25,6 +25,7 @@ from meshctl.apply.backup import (
 )
 from meshctl.apply.context import NodeContext
 from meshctl.apply.health_checks import Expectation
+from meshctl.apply.reconnect import open_repaired
 from meshctl.apply.station_flush import UNFLUSHED, StationFlushes
 from meshctl.cli.context import (
     AsJson,
@@ -197,11 +198,16 @@ def _restore(opened: Session, name: str, saved: Backup, *, as_json: bool) -> Jou
 
 def _restore_node(opened: Session, journaled: JournaledRun, node: Node, saved: Backup) -> Outcome:
     flushes = StationFlushes()
-    connection = opened.access.open(node)
+    known = opened.journal.last_known(opened.fleet.name)
+    connection, notes = open_repaired(
+        opened.access, opened.fleet, node, known, interrupt=opened.interrupt, observer=journaled.progress
+    )
     try:
         observation = observe_cleared(connection, (), opened.interrupt)
         _require_restorable(opened, node, saved, observation)
         ctx = _context(opened, journaled, node, observation, flushes)
+        for note in notes:
+            ctx.run.note(note, node.name)
         for package in uninstalled_packages(saved, observation):
             ctx.run.note(f"package {package} is in the backup but no longer installed", node.name)
         if saved.disabled:

@@ -12,18 +12,21 @@ from typing import Any, cast
 
 import pytest
 
+from meshctl.apply import reconnect as reconnecting
 from meshctl.apply.reconnect import (
     Reconnected,
     entries_of_unreachable,
     last_relays,
+    open_repaired,
     reconnect,
     repaired,
 )
 from meshctl.apply.stale_stations import StationEntry
-from meshctl.device.errors import ConnectionLost
+from meshctl.device.errors import HANDSHAKE, ConnectionLost, Timeout
 from meshctl.device.observation import Station
 from meshctl.fleet import Event, EventKind, Interrupt
 from meshctl.fleet.journal import LastKnown
+from meshctl.model import Node
 from meshctl.nodes.collect import FleetObservation
 from meshctl.nodes.connections import ConnectionPool, SshAddress
 from tests.meshctl.apply.mesh_nodes import MAC, MACS, OTHER, node
@@ -98,6 +101,72 @@ def test_a_node_that_does_not_answer_has_its_ssh_server_tried_by_its_neighbors(f
     calls = [line for line in script.splitlines() if line.startswith("flush_stale mesh0 ")]
     elsewhere = [f"flush_stale mesh0 {MAC} 0 {former} 2222"] if former == "10.42.0.99" else []
     assert calls == [f"flush_stale mesh0 {MAC} 0 {b02.address.ip} {b02.ssh.port}", *elsewhere]
+
+
+class Behind:
+    """b02, which does not answer until b01, which hears it, has removed a stale entry, if that helps."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, *, helps: bool, is_silent: bool = False) -> None:
+        self.asked: list[str] = []
+        self.tries = 0
+        self.helps, self.is_silent = helps, is_silent
+        heard = Station("mesh0", MAC, inactive_ms=200, connected_s=500)
+        around = {"b01": replace(running(fleet(), "b01", neighbors=()), stations=(heard,))}
+        monkeypatch.setattr(reconnecting, "collect", lambda *_, **__: FleetObservation(around, {}))
+        monkeypatch.setattr(reconnecting, "RELEARN_S", 0.0)
+        self.pool = cast(ConnectionPool, SimpleNamespace(open=self.open, borrow=self.borrow, former_places=dict))
+
+    def open(self, there: Node) -> Any:
+        self.tries += 1
+        if not self.asked or not self.helps:
+            raise Timeout("b02: no answer", phase=HANDSHAKE if self.is_silent else "connect")
+        return there.name
+
+    @contextmanager
+    def borrow(self, there: Node) -> Iterator[Any]:
+        def run(script: str, *, timeout_s: float) -> Any:
+            self.asked.append(there.name)
+            return SimpleNamespace(stdout=f"gone {MAC}\n")
+
+        yield SimpleNamespace(run=run)
+
+
+KNOWN = {"b02": LastKnown("b02", 1.0, {"macs": MAC})}
+
+
+def test_a_node_to_be_restored_is_reached_once_its_neighbors_have_repaired_their_links(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """`meshctl restore` gave up at the first attempt, although `provision` reaches such a node."""
+    behind, events = Behind(monkeypatch, helps=True), list[Event]()
+    b02 = fleet().nodes["b02"]
+    opened, notes = open_repaired(behind.pool, fleet(), b02, KNOWN, interrupt=Interrupt(), observer=events.append)
+    assert (str(opened), behind.asked, behind.tries) == ("b02", ["b01"], 2)
+    assert notes == ("b02: b01 removed a stale entry of its radio",)
+    assert [(event.kind, event.node) for event in events] == [(EventKind.STEP, "b02")]
+
+
+def test_a_node_that_stays_unreachable_is_tried_once_more_only_after_a_repair(monkeypatch: pytest.MonkeyPatch) -> None:
+    b02 = fleet().nodes["b02"]
+    behind = Behind(monkeypatch, helps=False)
+    with pytest.raises(Timeout):
+        open_repaired(behind.pool, fleet(), b02, KNOWN, interrupt=Interrupt())
+    assert behind.tries == 2
+    interrupt = Interrupt()
+    interrupt.request()
+    stopped = Behind(monkeypatch, helps=True)
+    with pytest.raises(Timeout):
+        open_repaired(stopped.pool, fleet(), b02, KNOWN, interrupt=interrupt)
+    assert (stopped.tries, stopped.asked) == (1, [])
+
+
+def test_no_link_is_repaired_to_a_node_whose_server_accepts_connections_and_stays_silent(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    behind = Behind(monkeypatch, helps=True, is_silent=True)
+    with pytest.raises(Timeout):
+        open_repaired(behind.pool, fleet(), fleet().nodes["b02"], KNOWN, interrupt=Interrupt())
+    assert (behind.tries, behind.asked) == (1, [])
 
 
 def test_only_neighbors_that_hear_an_unreachable_node_now_are_asked_for_stale_entries() -> None:
