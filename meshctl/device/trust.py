@@ -179,7 +179,9 @@ class TrustStore:
         except FileNotFoundError:
             return _PinTable(())
         except (OSError, UnicodeDecodeError) as error:
-            raise InputError(f"{self.path}: cannot read the pinned host keys: {error}") from error
+            reason = (error.strerror if isinstance(error, OSError) else "") or error
+            hint = "`operators.known_hosts` names a text file with a line for each key"
+            raise InputError(f"{self.path}: cannot read the pinned host keys: {reason}", hint=hint) from error
         table = _PinTable(parse_pins(text, source=str(self.path)))
         self._parsed = (state, table)
         return table

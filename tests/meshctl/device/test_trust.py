@@ -197,3 +197,10 @@ def test_an_invalid_line_is_rejected_with_its_line_number(line: str, said: str, 
     with pytest.raises(InputError, match=r"known_hosts:3: ") as caught:
         trust.check(B03, key(1))
     assert said in str(caught.value)
+
+
+def test_a_directory_in_place_of_the_file_is_named_in_words(tmp_path: Path) -> None:
+    with pytest.raises(InputError) as caught:
+        TrustStore(tmp_path).pinned("b01")
+    assert str(caught.value) == f"{tmp_path}: cannot read the pinned host keys: Is a directory"
+    assert "operators.known_hosts" in caught.value.hint
