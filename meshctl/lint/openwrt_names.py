@@ -35,8 +35,7 @@ SUBTARGETS: Mapping[str, frozenset[str]] = MappingProxyType(
         "x86": _words("64 generic geode legacy"),
     }
 )
-# device tree paths of built-in radios, which exist only on boards of this target, and their driver where its limits are
-# known
+# device tree paths of radios that exist only on boards of this target, and their driver where its limits are known
 _CHIPS = (
     (re.compile(r"platform/ahb/.*\.wmac"), "ath79", "ath9k"),
     (re.compile(r"platform/(ar9\w+|qca9\w+)_wmac"), "ar71xx", "ath9k"),
@@ -45,6 +44,11 @@ _CHIPS = (
     (re.compile(r"platform/(soc/)?18000000\.(wmac|wifi)"), "mediatek", ""),
     (re.compile(r"platform/soc/a[08]00000\.wifi"), "ipq40xx", "ath10k-ct"),
     (re.compile(r"platform/soc@0/c000000\.wifi"), "qualcommax", ""),
+    # behind the chip's own PCI controller; the driver is that of the card
+    (re.compile(r"(platform/)?1e140000\.pcie/pci.*"), "ramips", ""),
+    (re.compile(r"(platform/)?(1a14[35]000|11280000)\.pcie/pci.*"), "mediatek", ""),
+    (re.compile(r"(platform/)?soc/40000000\.pcie?/pci.*"), "ipq40xx", ""),
+    (re.compile(r"(platform/)?soc/1b[579]00000\.pcie?/pci.*"), "ipq806x", ""),
 )
 _RADIO_PATHS = _words(
     """platform/ahb/18100000.wmac platform/ar933x_wmac platform/ar934x_wmac platform/qca953x_wmac platform/qca955x_wmac
@@ -67,7 +71,7 @@ _MIN_LETTERS = 6
 
 
 def chip_target(radio_path: str) -> str | None:
-    """The only target with a radio at this path; None if any target may have it (PCI, USB)."""
+    """The only target with a radio at this path; None if several may: USB, PCI without the chip's controller."""
     return next((target for pattern, target, _ in _CHIPS if pattern.fullmatch(radio_path)), None)
 
 

@@ -129,7 +129,7 @@ def _meant(driver: str) -> tuple[str, ...]:
     section is ignored, and the node comes up without a mesh.""",
     fix="Copy the path from the device: `uci get wireless.radio0.path`.",
     failing="hardware: {rocket: {radios: {radio0: {path: 'pci000:00/0000:00:00.0'}}}}",
-    passing="hardware: {rocket: {radios: {radio0: {path: '1e140000.pcie/pci0000:00/0000:00:01.0/0000:02:00.0'}}}}",
+    passing="hardware: {rocket: {radios: {radio0: {path: 'pci0000:00/0000:00:01.0/0000:02:00.0'}}}}",
 )
 def path_of_no_device(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for profile in fleet.hardware.values():

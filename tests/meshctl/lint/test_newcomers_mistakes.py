@@ -241,3 +241,22 @@ def test_radios_with_the_names_of_robots_are_one_finding(tmp_path: Path) -> None
     nodes += '"r[1-5]": {role: beacon, hardware: rocket, address: {from: 10.42.0.211}}}\nrobots:\n'
     (finding,) = [one for one in _found(nodes + _ROBOTS, tmp_path) if one.code == "MC120"]
     assert (finding.path, finding.found) == ("robots.r1", "r1, r2, r3, r4 and 1 more")
+
+
+@pytest.mark.parametrize(
+    ("path", "target"),
+    [
+        ("1e140000.pcie/pci0000:00/0000:00:01.0/0000:02:00.0", "ramips/mt7621"),
+        ("1a143000.pcie/pci0000:00/0000:00:00.0/0000:01:00.0", "mediatek/mt7622"),
+        ("soc/40000000.pci/pci0000:00/0000:00:00.0/0000:01:00.0", "ipq40xx/generic"),
+        ("soc/1b500000.pci/pci0000:00/0000:00:00.0/0000:01:00.0", "ipq806x/generic"),
+        ("pci0000:00/0000:00:00.0", ""),
+    ],
+)
+def test_the_controller_of_a_pci_radio_tells_the_chip(path: str, target: str, tmp_path: Path) -> None:
+    fragment = f"hardware: {{rocket: {{radios: {{radio0: {{path: '{path}'}}}}}}}}"
+    found = [one for one in _found(fragment, tmp_path) if one.code == "MC834"]
+    assert [one.expected for one in found] == ([f"{target.partition('/')[0]}/..."] if target else [])
+    (tmp_path / "right").mkdir()
+    right = fragment.replace("radios:", f"target: {target or 'ath79/generic'}, radios:")
+    assert [one for one in _found(right, tmp_path / "right") if one.code == "MC834"] == []
