@@ -50,7 +50,7 @@ def zone_taken(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     "The firewall is open toward an uplink",
     why="""What is beyond an uplink is not the team's: the internet, a provider's or a client's network. With
     `input: ACCEPT`, or without a policy where the default is that, everyone there reaches the node's SSH, name and web
-    servers; a forwarding from the uplink's zone leads to all radios and robots.""",
+    servers, as they do by a rule without `dest_port`; a forwarding from its zone leads to all radios and robots.""",
     fix="""Set `input: REJECT` for the uplink's zone, remove the forwarding, and open single ports with a `rule`.
     Answers to the node's own connections pass in any case. If the uplink is a trusted network, suppress this finding
     with that reason.""",
@@ -69,20 +69,34 @@ def uplink_open(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
             inside = [name for name in zone.get("network").split() if name in uplinks]
             outer |= {zone.get("name")} if inside else set()
             policy = zone.get("input") or default
-            if inside and policy.upper() == "ACCEPT":
+            if inside and policy == "ACCEPT":
                 own = f"firewall.{zone.name}"
                 keys = (f"{own}.input", f"{own}.network", own)
                 key = next((key for key in keys if key in node.extra_uci), f"network.{inside[0]}")
                 message = f"everyone beyond {', '.join(inside)} reaches this node's servers"
                 yield Finding(("nodes", node.name, "extra_uci", key), message, "input REJECT", f"input {policy}")
-        for name, forwarding in created_sections(node, packages, "firewall"):
-            source, dest = forwarding.get("src"), forwarding.get("dest")
-            if forwarding.type == "forwarding" and source in outer and dest and dest not in outer:
-                key = f"firewall.{name}.src" if f"firewall.{name}.src" in node.extra_uci else f"firewall.{name}"
-                message = f"everyone beyond {source} reaches what is in {dest}"
-                yield Finding(
-                    ("nodes", node.name, "extra_uci", key), message, f"src {dest}, dest {source}", f"src {source}"
-                )
+        for name, section in created_sections(node, packages, "firewall"):
+            source, dest = section.get("src"), section.get("dest")
+            if source not in outer or dest in outer or not _lets_all_in(section):
+                continue
+            key = f"firewall.{name}.src" if f"firewall.{name}.src" in node.extra_uci else f"firewall.{name}"
+            reached = f"what is in {dest}" if dest else "this node's servers"
+            expected = (
+                f"src {dest}, dest {source}" if section.type == "forwarding" else "a rule with dest_port or src_ip"
+            )
+            message = f"everyone beyond {source} reaches {reached}"
+            yield Finding(("nodes", node.name, "extra_uci", key), message, expected, f"src {source}")
+
+
+def _lets_all_in(section: Section) -> bool:
+    """Whether it is a forwarding, or a rule that accepts connections from anywhere to any port."""
+    if section.type == "forwarding":
+        return bool(section.get("dest"))
+    is_narrow = any(section.get(option) for option in ("dest_port", "src_port", "src_ip", "src_mac", "ipset", "mark"))
+    protocols = set(section.get("proto").lower().split())
+    reaches_servers = not protocols or bool(protocols & {"all", "any", "*", "tcp", "tcpudp", "udp"})
+    is_accepting = section.type == "rule" and section.get("target") == "ACCEPT"
+    return is_accepting and reaches_servers and not is_narrow and section.get("enabled") != "0"
 
 
 def _is_uplink(interface: Section) -> bool:

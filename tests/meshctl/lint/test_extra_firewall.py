@@ -119,6 +119,7 @@ def test_an_address_without_its_netmask_is_one_finding(tmp_path: Path) -> None:
     assert [one.code for one in findings] == ["MC924"]
 
 
+_ANY_PORT = {"firewall.open": "rule", "firewall.open.src": "wan", "firewall.open.target": "ACCEPT"}
 _FORWARDING = {"firewall.inward": "forwarding", "firewall.inward.src": "wan", "firewall.inward.dest": "management"}
 
 
@@ -138,6 +139,12 @@ _FORWARDING = {"firewall.inward": "forwarding", "firewall.inward.src": "wan", "f
             "input ACCEPT",
         ),
         (_FORWARDING, "firewall.inward.src", "src wan"),
+        (_ANY_PORT, "firewall.open.src", "src wan"),
+        (
+            {**_ANY_PORT, "firewall.open.proto": "tcp", "firewall.open.dest": "management"},
+            "firewall.open.src",
+            "src wan",
+        ),
         ({"firewall.management.network": "lan wan"}, "firewall.management.network", "input ACCEPT"),
     ],
 )
@@ -157,6 +164,10 @@ def test_a_firewall_that_is_open_toward_an_uplink_is_reported(
         {"network.wan.proto": "wireguard", "network.wan.device": None, "firewall.wan.input": "ACCEPT"},
         {**_FORWARDING, "firewall.inward.src": "management", "firewall.inward.dest": "wan"},
         {"firewall.wan.input": None},
+        {**_ANY_PORT, "firewall.open.proto": "icmp"},
+        {**_ANY_PORT, "firewall.open.dest_port": "22"},
+        {**_ANY_PORT, "firewall.open.src_ip": "192.0.2.0/24"},
+        {**_ANY_PORT, "firewall.open.target": "DROP"},
     ],
 )  # fmt: skip
 def test_a_firewall_that_is_closed_toward_its_uplink_is_sound(changes: dict[str, str | None], tmp_path: Path) -> None:
