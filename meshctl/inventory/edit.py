@@ -99,6 +99,16 @@ class Editor:
     def set_nodes(self, values: Mapping[str, Mapping[str, Value]]) -> None:
         """Set values of many nodes, as `set_node` does of one. A file is parsed once for each key and not for each
         node, so that the time grows with the nodes and not with their square."""
+        texts, roots = dict(self._texts), dict(self._roots)
+        try:
+            self._set_nodes_at_once(values)
+        except InputError:
+            # one at a time may work nevertheless: another order, and a file that is parsed after each
+            self._texts, self._roots = texts, roots
+            for node, fields in values.items():
+                set_node(self, node, fields)
+
+    def _set_nodes_at_once(self, values: Mapping[str, Mapping[str, Value]]) -> None:
         is_known = {node: self.has(("nodes", node)) for node in values}
         known = [node for node in values if is_known[node]]
         added = [node for node in values if not is_known[node]]

@@ -11,7 +11,7 @@ from pathlib import Path
 from textwrap import dedent
 
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from meshctl.diagnostics import InvalidInput
@@ -407,6 +407,7 @@ def test_an_edit_in_any_layout_is_applied_correctly_or_rejected(
     tail=st.sampled_from(["", "\n  ", "topics: {}\n"]),
 )
 @settings(max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@example(entries=["  l:\n    label: >+\n      text\n\n\n"], values={key: {"label": "n: w"} for key in "la"}, tail="")
 def test_many_nodes_are_set_as_one_after_the_other(
     entries: list[str], values: dict[str, dict[str, Value]], tail: str, tmp_path: Path
 ) -> None:
