@@ -231,7 +231,7 @@ def _connection(ctx: NodeContext) -> SshConnection:
 def _simultaneous_stage(
     stage: Stage, contexts: Mapping[str, NodeContext], plan: Plan, run_context: RunContext, observer: Observer
 ) -> dict[str, Outcome]:
-    """Install packages first, which interrupts nothing; then change all nodes simultaneously."""
+    """Install packages first, one node at a time; then change all nodes simultaneously."""
     began = time.monotonic()
     for name in stage.nodes:
         observer(Event(EventKind.STARTED, name, time.time()))
@@ -270,5 +270,7 @@ def _packages_first(stage: Stage, contexts: Mapping[str, NodeContext]) -> dict[s
         except NodeError as error:
             outcome = outcome_of_error(name, error)
         if not outcome.result.is_good:
+            # the change is canceled on all, so the others keep their packages, too
             failed[name] = outcome
+            break
     return failed
