@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from meshctl.apply import executor
+from meshctl.errors import Unreachable
 from meshctl.fleet import Outcome, Result
 from meshctl.fleet.events import silent
 from meshctl.plan import PackageStep, Stage, StageKind
@@ -35,3 +36,33 @@ def test_a_failed_installation_is_not_repeated_on_the_other_nodes(monkeypatch: p
         "base": Result.PENDING,
     }
     assert ended["base"].reason == "the mesh change was canceled: packages could not be installed on b02"
+
+
+def test_after_another_supplicant_the_nodes_are_connected_again_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Seen on real OpenWrt: the base's radio had restarted, no node behind it could be armed, and all was canceled."""
+    events: list[str] = []
+    attempts = iter([Unreachable("no route"), Unreachable("no route"), None, None])
+
+    def connection(ctx: Any) -> None:
+        error = next(attempts)
+        if error is not None:
+            raise error
+
+    def commit(_run: object, given: Any, **_rest: object) -> dict[str, Outcome]:
+        events.append("commit")
+        return {ctx.name: Outcome(ctx.name, Result.DONE) for ctx in given}
+
+    pool = SimpleNamespace(
+        drop=lambda name: events.append(f"drop {name}"), release=lambda name, _made: events.append(f"connected {name}")
+    )
+    interrupt = SimpleNamespace(stopping=False, wait=lambda _s: events.append("wait"))
+    fleet = SimpleNamespace(apply=SimpleNamespace(quorum=1.0, parallel=1))
+    run: Any = SimpleNamespace(connections=pool, interrupt=interrupt, fleet=fleet)
+    step = PackageStep(("wpad-openssl",), ("wpad-openssl.apk",), ("wpad-basic",))
+    monkeypatch.setattr(executor, "_packages_first", lambda *_given: {})
+    monkeypatch.setattr(executor, "_connection", connection)
+    monkeypatch.setattr(executor, "commit_mesh", commit)
+    plan: Any = SimpleNamespace(packages=step, reloads=("wireless",), entries=("base",))
+    contexts: Any = {name: SimpleNamespace(name=name, plan=plan, run=run) for name in ("b01", "base")}
+    executor._simultaneous_stage(Stage(StageKind.SWITCH, tuple(contexts), "", mesh="main"), contexts, plan, run, silent)
+    assert events == ["drop b01", "wait", "wait", "connected b01", "drop base", "connected base", "commit"]
