@@ -7,7 +7,7 @@ as one. A failed canary, an exhausted failure budget or Ctrl-C prevents further 
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -98,6 +98,7 @@ def unflushed_since(prepared: Prepared, journal: Journal) -> dict[str, float]:
     return {name: at_s for name, at_s in since_s.items() if name in prepared.plan.nodes and name in observations}
 
 
+_RECONNECT_S = 90.0
 # Results of a node that was in progress and is unreachable now.
 _LOST = (Result.UNCERTAIN, Result.UNREACHABLE)
 
@@ -231,7 +232,7 @@ def _connection(ctx: NodeContext) -> SshConnection:
 def _simultaneous_stage(
     stage: Stage, contexts: Mapping[str, NodeContext], plan: Plan, run_context: RunContext, observer: Observer
 ) -> dict[str, Outcome]:
-    """Install packages first, which interrupts nothing; then change all nodes simultaneously."""
+    """Install packages first, one node at a time; then change all nodes simultaneously."""
     began = time.monotonic()
     for name in stage.nodes:
         observer(Event(EventKind.STARTED, name, time.time()))
@@ -244,6 +245,8 @@ def _simultaneous_stage(
         with_files = [name for name in stage.nodes if contexts[name].plan.reloads]
         ended = {name: Outcome(name, Result.DONE) for name in stage.nodes}
         if with_files:
+            if any(step.remove for name in stage.nodes if (step := contexts[name].plan.packages) is not None):
+                _connect_again(contexts[name] for name in with_files)
             ended |= commit_mesh(
                 run_context,
                 [contexts[name] for name in with_files],
@@ -259,6 +262,23 @@ def _simultaneous_stage(
     return updated
 
 
+def _connect_again(contexts: Iterable[NodeContext]) -> None:
+    """Another supplicant restarts the radios, the entry's last: connections through it are cut, and batman-adv's loop
+    avoidance may hold new ones for 30 s. Who does not answer in time is found by `commit_mesh`."""
+    until = time.monotonic() + _RECONNECT_S
+    for ctx in contexts:
+        connections = ctx.run.connections
+        connections.drop(ctx.name)
+        while not ctx.run.interrupt.stopping:
+            try:
+                connections.release(ctx.name, _connection(ctx))
+                break
+            except NodeError:
+                if time.monotonic() >= until:
+                    break
+                ctx.run.interrupt.wait(1.0)
+
+
 def _packages_first(stage: Stage, contexts: Mapping[str, NodeContext]) -> dict[str, Outcome]:
     failed: dict[str, Outcome] = {}
     for name in stage.nodes:
@@ -270,5 +290,7 @@ def _packages_first(stage: Stage, contexts: Mapping[str, NodeContext]) -> dict[s
         except NodeError as error:
             outcome = outcome_of_error(name, error)
         if not outcome.result.is_good:
+            # the change is canceled on all, so the others keep their packages, too
             failed[name] = outcome
+            break
     return failed

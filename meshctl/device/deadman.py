@@ -42,6 +42,8 @@ _NO_ROOM = f"echo 'refused tmp-full no room in {BUNDLE_DIRECTORY} for the bundle
 _PATH = re.compile(r"(?:/[A-Za-z0-9._+@-]+){2,}")
 _LINK_TARGET = re.compile(r"\.\./init\.d/[A-Za-z0-9._+@-]+")
 _WORD = re.compile(r"[A-Za-z0-9][A-Za-z0-9@._:+-]*")
+# OpenWrt's versions have "~", as in wpad-mesh-mbedtls-2025.08.26~ca266cc2-r1.apk
+_PACKAGE = re.compile(r"[\w@%+=:,./~-]+", re.ASCII)
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,10 +85,15 @@ def packages(tool: str, files: Iterable[str], remove: Iterable[str] = ()) -> str
     if tool not in ("opkg", "apk"):
         raise ValueError(f"expected opkg or apk, found {tool!r}")
     for word in (*words["FILES"], *words["REMOVE"]):
-        if shlex.quote(word) != word:
+        if not is_package_word(word):
             raise ValueError(f"{word!r}: expected a path or a name without blanks and quotes")
     lines = [f"{name}='{' '.join(given)}'" for name, given in words.items()]
     return "\n".join([*lines, script("packages.sh")])
+
+
+def is_package_word(word: str) -> bool:
+    """Whether the word is a package's name, or the path of a package file that `packages` accepts."""
+    return _PACKAGE.fullmatch(word) is not None and not word.startswith("~")
 
 
 def bundle(change: Change) -> bytes:

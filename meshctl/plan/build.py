@@ -38,7 +38,8 @@ def fleet_plan(
     `together`: all nodes of running meshes change simultaneously. `pace` is that of earlier changes.
     """
     entries = (entry,) if entry else tuple(fleet.bases_of(plans))
-    found = switches(fleet, plans, unchanged=unchanged, acknowledged=leave_behind, never_meshed=never_meshed)
+    acknowledged = tuple(leave_behind)
+    found = switches(fleet, plans, unchanged=unchanged, acknowledged=acknowledged, never_meshed=never_meshed)
     robots = {node.name: node.robot for node in fleet.nodes.values()}
     surroundings = MeshContext(graph, entries, fleet.apply, robots, independent_meshes(fleet, graph, entries))
     todo = [plan for plan in plans.values() if plan.verdict is Verdict.CHANGE]
@@ -46,7 +47,7 @@ def fleet_plan(
     at_once = stages_together(todo, surroundings, found.nodes)
     stages = at_once if together else in_order
     cut_off_by = graph.cut_off_by_any(entries)
-    refusal, hint = _refusal(found, plans, cut_off_by, frozenset(accept_cuts))
+    refusal, hint = _refusal(found, plans, cut_off_by, frozenset(accept_cuts), acknowledged)
     if together and not refusal:
         refusal, hint = _refused_together(at_once, plans)
     windows = [fleet.nodes[plan.node].confirm_window_s for plan in todo]
@@ -121,6 +122,7 @@ def _refusal(
     plans: Mapping[str, NodePlan],
     cut_off_by: Mapping[str, tuple[str, ...]],
     accepted: frozenset[str],
+    acknowledged: tuple[str, ...],
 ) -> tuple[str, str]:
     for mesh, why in found.blocked.items():
         flashes = any(plan.firmware is not None and mesh in plan.parted_from for plan in plans.values())
@@ -131,8 +133,10 @@ def _refusal(
             else "fix the refused nodes, then plan again",
         )
     for mesh, names in found.left_behind.items():
-        few = len(names) <= MAX_IN_FULL
-        how = ",".join(names) if few else "and what selects them ('group:far,state:carried', @FILE, or all)"
+        # the option is given once, with all of them
+        needed = (*acknowledged, *names)
+        few = len(needed) <= MAX_IN_FULL
+        how = ",".join(needed) if few else "and what selects them ('group:far,state:carried', @FILE, or all)"
         return (
             f"mesh {mesh} changes its cell and would leave behind {node_list(names)}: unreachable, or not "
             "part of this plan",

@@ -7,9 +7,11 @@ from dataclasses import dataclass
 
 from meshctl.device.observation import Observation
 from meshctl.model import Node
+from meshctl.plan.cell import enabled_interfaces
 from meshctl.plan.firmware import runs_release
-from meshctl.plan.packages import unavailable
+from meshctl.plan.packages import package_name, unavailable
 from meshctl.plan.values import PackageStep
+from meshctl.resolve import FULL_SUPPLICANTS
 from meshctl.uci import Package, masked_changes
 from meshctl.wording import lock_owners
 
@@ -133,6 +135,29 @@ def _packages(case: _Checked) -> FailedPrecondition | None:
     )
 
 
+def _supplicant(case: _Checked) -> FailedPrecondition | None:
+    """Packages come before files, so the node would have to be in its encrypted mesh without the supplicant for it."""
+    step = case.packages
+    removed = () if step is None or case.is_flashed else step.remove
+    there = {*(case.observation.packages or {}), *map(package_name, () if step is None else step.files)}
+    encrypted = _encrypted_meshes(case.uci.get("wireless"))
+    if not encrypted or not set(removed) & set(FULL_SUPPLICANTS) or (there - set(removed)) & set(FULL_SUPPLICANTS):
+        return None
+    full = ", ".join(name for name in removed if name in FULL_SUPPLICANTS)
+    return FailedPrecondition(
+        f"{full} would be removed while {', '.join(encrypted)} is encrypted, and the node would leave its mesh",
+        "make the mesh open first, with the packages as they are; then change the packages",
+    )
+
+
+def _encrypted_meshes(wireless: Package | None) -> tuple[str, ...]:
+    return tuple(
+        face.get("ifname") or face.name or "a radio interface"
+        for face, _ in enabled_interfaces(wireless)
+        if face.get("mode") in ("mesh", "adhoc") and face.get("encryption", "none") != "none"
+    )
+
+
 def _foreign_changes(case: _Checked) -> FailedPrecondition | None:
     changes = case.observation.uci_changes
     if not changes:
@@ -181,6 +206,7 @@ _CHECKS: tuple[Callable[[_Checked], FailedPrecondition | None], ...] = (
     _radio_abilities,
     _lan_ports,
     _packages,
+    _supplicant,
     _foreign_changes,
     _unconfirmed_changes,
     _other_operator,

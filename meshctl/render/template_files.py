@@ -57,4 +57,9 @@ def template_files(layers: list[tuple[str, Path]], boundary: Boundary) -> tuple[
             if not source.name.startswith("_") and source.is_file():
                 path = inside.removesuffix(SUFFIX)
                 found.setdefault(path, TemplateFile(path, f"{prefix}/{inside}", source))
+    if not found:
+        # without this, every node without configuration would be up to date
+        place = Position(str(shipped("templates")))
+        hint = "its installation is incomplete: install meshctl again"
+        raise InvalidInput([Diagnostic(NO_TEMPLATE, Severity.ERROR, place, "the templates are missing", hint=hint)])
     return tuple(found[path] for path in sorted(found))

@@ -22,7 +22,7 @@ from meshctl.status.radio_facts import neighbors_of, radios_of, snr_of, temperat
 from meshctl.status.robots import RobotAnswers, robot_status
 from meshctl.status.unreachable import NOT_ASKED, lost_relay_alarm, no_answer_alarm
 from meshctl.status.values import Alarm, FleetStatus, Health, Level, NoAnswer, NodeStatus, health_of
-from meshctl.topology import Graph, Report, Sighting, heard_by_name, seen_by
+from meshctl.topology import NEIGHBOR_FRESH_MS, Graph, Report, Sighting, heard_by_name, seen_by
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +74,7 @@ def assess(snapshot: Snapshot, nodes: Iterable[Node], now: float, robots: Iterab
     """The status of these radios and robots at `now` (Unix time)."""
     reports = snapshot.reports
     sightings = seen_by(reports.values(), snapshot.macs)
+    refusals = _refusals(snapshot)
     paths = {} if snapshot.is_partial else snapshot.graph.paths_to_any(snapshot.entries)
     cut_off_by = {} if snapshot.is_partial else snapshot.graph.cut_off_by_any(snapshot.entries)
     entry_by_site = snapshot.entry_by_site
@@ -87,7 +88,8 @@ def assess(snapshot: Snapshot, nodes: Iterable[Node], now: float, robots: Iterab
     for node in nodes:
         observation = snapshot.observations.get(node.name)
         if observation is None:
-            statuses.append(_unreachable_status(snapshot, node, sightings.get(node.name, ()), now))
+            refused_by = refusals.get(node.name, ())
+            statuses.append(_unreachable_status(snapshot, node, sightings.get(node.name, ()), now, refused_by))
             continue
         last = snapshot.known.get(node.name)
         # the robot that carries a beacon, and its rack, may use it as a relay while it is on board
@@ -194,7 +196,26 @@ def _site_alarms(snapshot: Snapshot, now: float) -> Iterable[Alarm]:
         yield Alarm(Level.WARNING, "site", f"no contact with site {site} ({why.reason}): {shown}", why.hint)
 
 
-def _unreachable_status(snapshot: Snapshot, node: Node, heard_by: tuple[Sighting, ...], now: float) -> NodeStatus:
+def _refusals(snapshot: Snapshot) -> dict[str, tuple[Sighting, ...]]:
+    """Node -> the nodes whose radios hear it, but have no 802.11s link to it."""
+    found: dict[str, list[Sighting]] = {}
+    for by, observed in snapshot.observations.items():
+        for station in observed.stations or ():
+            other = snapshot.macs.get(station.mac)
+            # of a station that has not been heard at all, iw says 0 ms, and no signal
+            is_heard = station.signal_dbm is not None and (station.inactive_ms or 0) <= NEIGHBOR_FRESH_MS
+            if other is not None and is_heard and not station.can_forward:
+                found.setdefault(other, []).append(Sighting(by, station.inactive_ms or 0, station.signal_dbm))
+    return {name: tuple(seen) for name, seen in found.items()}
+
+
+def _unreachable_status(
+    snapshot: Snapshot,
+    node: Node,
+    heard_by: tuple[Sighting, ...],
+    now: float,
+    refused_by: tuple[Sighting, ...],
+) -> NodeStatus:
     last = snapshot.known.get(node.name)
     why = snapshot.no_answer.get(node.name, NOT_ASKED)
     is_required = node.state is NodeState.DEPLOYED
@@ -206,6 +227,7 @@ def _unreachable_status(snapshot: Snapshot, node: Node, heard_by: tuple[Sighting
         is_required=is_required,
         trust=f"meshctl trust {node.name}",
         first_contact_hint=f"if it is not set up yet: meshctl bootstrap {node.name}",
+        refused_by=refused_by,
     )
     if alarm is not None and why.code == "host-key" and node.name in _formers_in_mesh(snapshot).values():
         alarm = replace(

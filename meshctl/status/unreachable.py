@@ -49,11 +49,12 @@ def no_answer_alarm(
     is_required: bool,
     trust: str,
     first_contact_hint: str,
+    refused_by: Sequence[Sighting] = (),
 ) -> Alarm | None:
     """The alarm of a device that did not answer; None for one that may be off and is heard by no node.
 
     `is_required`: it must answer. `trust` is the command that pins its key, `first_contact_hint` the hint for a device
-    that never answered.
+    that never answered, `refused_by` the nodes whose radios hear it but have no 802.11s link to it.
     """
     sighting = sighting_text(heard_by)
     if why.of_gateway:
@@ -73,6 +74,10 @@ def no_answer_alarm(
     if sighting:
         hint = "it is on and in range: wait a minute, then run meshctl provision; if that fails, keep it off for 2 min"
         return Alarm(Level.ERROR, "unreachable", f"{why.reason}; {last_answer}; {sighting}", hint)
+    if refused_by:
+        text = f"{why.reason}; {last_answer}; {sighting_text(refused_by)}, but their 802.11s link does not come up"
+        hint = "if it stays so, it has another key: reach it by cable, then meshctl provision with --leave-behind all"
+        return Alarm(Level.ERROR, "unreachable", text, hint)
     hint = first_contact_hint if last is None else last_place_hint(last)
     return Alarm(Level.ERROR, "unreachable", f"{why.reason}; {last_answer}; no node hears it", hint)
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
+from pathlib import Path, PurePath
 
 from meshctl import firmware
+from meshctl.device.deadman import is_package_word
 from meshctl.diagnostics import Severity
 from meshctl.firmware.check import (
     BAD_SIGNATURE,
@@ -222,6 +223,8 @@ def package_file_wrong(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
             if not name.endswith(suffix):
                 message = f"OpenWrt {profile.release} does not install this type"
                 yield Finding((*place, str(index)), message, f"a file with {suffix}", name)
+            elif not is_package_word(PurePath(name).name):
+                yield Finding((*place, str(index)), "not sent to a node", "a file name without blanks and quotes", name)
             elif context.files.size_bytes(file_path(fleet, name)) is None:
                 yield Finding((*place, str(index)), "no such file", "a package file", name)
 

@@ -153,11 +153,15 @@ esac
 """
 
 
+# as in 24.10 and 25.12
+_VERSION = "2025.08.26~ca266cc2-r1"
+
+
 def package(tool: str, name: str, files: dict[str, str]) -> tuple[str, bytes]:
     """A package's file on the node, and its content."""
     if tool == "apk":
-        return f"/tmp/meshctl/packages/{name}-1.apk", apk_package(name, "1", files)
-    return f"/tmp/meshctl/packages/{name}_1_mips.ipk", opkg_package(name, "1", files)
+        return f"/tmp/meshctl/packages/{name}-{_VERSION}.apk", apk_package(name, _VERSION, files)
+    return f"/tmp/meshctl/packages/{name}_{_VERSION}_mips.ipk", opkg_package(name, _VERSION, files)
 
 
 def install_tool(node: Sandbox, tool: str, installed: dict[str, dict[str, str]]) -> None:

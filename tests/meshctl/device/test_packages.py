@@ -241,7 +241,8 @@ def test_a_package_file_that_cannot_be_read_is_refused(node: Sandbox, tool: str)
 
 
 def test_paths_with_blanks_and_unknown_package_managers_are_rejected() -> None:
-    with pytest.raises(ValueError, match="without blanks"):
-        packages("opkg", ["/tmp/a b.ipk"])
+    for name in ("/tmp/a b.ipk", "/tmp/it's.ipk", "/tmp/$(reboot).ipk", "~/a.ipk", ""):
+        with pytest.raises(ValueError, match="without blanks"):
+            packages("opkg", [name])
     with pytest.raises(ValueError, match="expected opkg or apk"):
         packages("dpkg", [])

@@ -106,6 +106,16 @@ def test_a_package_file_is_found_beside_the_included_file_that_names_it(tmp_path
     }
 
 
+@pytest.mark.parametrize(
+    ("name", "found"),
+    [("wpad-mesh-mbedtls_2025.08.26~ca266cc2-r1_mips_24kc.ipk", False), ("tool (1).ipk", True), ("it's.ipk", True)],
+)
+def test_a_package_file_whose_name_cannot_be_sent_is_found(name: str, found: bool, tmp_path: Path) -> None:
+    """`provision` ended with a traceback."""
+    example = Example(f'hardware: {{rocket: {{package_files: ["{name}"]}}}}', files={name: "package"})
+    assert ("MC811" in {one.code for one in _found(example, tmp_path)}) is found
+
+
 def test_a_router_named_by_its_address_in_its_lan_is_a_radio(tmp_path: Path) -> None:
     robots = "robots: {base-station: {lan: {network: 10.43.0.0/24}, computer: {address: 10.43.0.10/24}}}"
     found = [one for one in _found(f"system: {{log_host: 10.43.0.1}}\n{robots}", tmp_path) if one.code == "MC235"]

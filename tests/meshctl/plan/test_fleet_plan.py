@@ -74,6 +74,9 @@ def test_a_switch_leaves_nodes_behind_only_if_acknowledged() -> None:
     assert plan.refusal_hint == "switch them on and select them too, or acknowledge with --leave-behind b03"
     new = fleet(channel=11)
     seen = {name: None if name == "b03" else running(fleet(), name) for name in TEAM}
+    # the option is given once: following the hint had only exchanged the names
+    other = fleet_plan(new, plans(new, seen), STAR, now_s=0.0, leave_behind=["b02"])
+    assert other.refusal_hint.endswith("acknowledge with --leave-behind b02,b03")
     assert fleet_plan(new, plans(new, seen), STAR, now_s=0.0, leave_behind=["b03"]).refusal == ""
     assert fleet_plan(new, plans(new, seen), STAR, now_s=0.0, leave_behind=["all"]).refusal == ""
     assert fleet_plan(new, plans(new, seen), STAR, now_s=0.0, never_meshed=["b03"]).refusal == ""

@@ -11,6 +11,7 @@ import pytest
 from meshctl.device.observation import BoardInfo, ChangeStatus, ReleaseInfo
 from meshctl.plan import Cut, Plan, Verdict, node_plan
 from meshctl.plan.masking import Fingerprints
+from meshctl.plan.packages import Needs
 from meshctl.report.plan_text import plan_lines
 from meshctl.uci import Section
 from tests.meshctl.plan.support import FINGERPRINTS, PASS_PHRASE, factory, fleet, planned, running, wanted
@@ -194,6 +195,30 @@ def test_replacing_the_supplicant_cuts_the_mesh_although_no_file_changes() -> No
         "all radios restart, because wpad-basic-mbedtls is replaced": Cut.MESH
     }
     assert effects_with("nano") == {}
+
+
+@pytest.mark.parametrize(
+    ("new", "is_open", "refused"),
+    [("wpad-basic-mbedtls", False, True), ("wpad-openssl", False, False), ("wpad-basic-mbedtls", True, False)],
+)
+def test_the_supplicant_of_a_mesh_that_is_still_encrypted_is_not_removed(
+    new: str, is_open: bool, refused: bool
+) -> None:
+    """Packages come before files: it left the mesh, and rolled back at the end of its window."""
+    seen = running(fleet(), "b01")
+    assert seen.uci is not None
+    if is_open:
+        wireless = seen.uci["wireless"].replace("option encryption 'psk2+ccmp'", "option encryption 'none'")
+        seen = replace(seen, uci={**seen.uci, "wireless": wireless})
+    (full,) = (name for name in seen.packages or {} if name.startswith("wpad"))
+    want = replace(wanted(fleet(), "b01"), needs=Needs(((new,),), (full,)), package_files=(f"{new}_1_mips.ipk",))
+    plan = node_plan(want, seen, FINGERPRINTS, owner="", with_firmware=False)
+    if refused:
+        assert plan.verdict is Verdict.REFUSED
+        assert plan.reason == f"{full} would be removed while mesh0 is encrypted, and the node would leave its mesh"
+    else:
+        assert plan.packages is not None
+        assert plan.packages.remove == (full,)
 
 
 def test_an_untagged_port_to_a_vlan_switch_is_planned_with_a_note() -> None:

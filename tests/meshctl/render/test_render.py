@@ -11,8 +11,21 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from meshctl.diagnostics import InvalidInput
-from meshctl.model import MASK, Encryption, Fleet, MeshMode, NodeState, OperatorParts, Operators, Secret, SystemSettings
+from meshctl.file_access import Boundary
+from meshctl.model import (
+    MASK,
+    Backend,
+    Encryption,
+    Fleet,
+    MeshMode,
+    NodeState,
+    OperatorParts,
+    Operators,
+    Secret,
+    SystemSettings,
+)
 from meshctl.render import DeviceFacts, Rendered, Templates, UnknownNode, render_fleet, render_node
+from meshctl.render.template_set import TemplateSet
 from meshctl.uci import dump, parse
 from tests.meshctl.render import fleets
 
@@ -127,6 +140,14 @@ def test_authorized_keys_is_readable_by_root_only() -> None:
 def test_a_fleet_renders_its_managed_nodes_in_order() -> None:
     nodes = [fleets.node(name=name, state=state) for name, state in zip("dcba", NodeState, strict=False)]
     assert [item.node for item in render_fleet(fleets.fleet(*nodes), fleets.secrets, SHARED)] == ["d", "c", "b"]
+
+
+def test_an_installation_without_templates_renders_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every node would have had the configuration without any file, which was up to date on all of them."""
+    monkeypatch.setattr("meshctl.resources._SHIPPED", tmp_path)
+    boundary = Boundary((str(tmp_path),))
+    with pytest.raises(InvalidInput, match="templates are missing"):
+        TemplateSet((tmp_path / "templates",), Backend.BATMAN, OperatorParts(), boundary)
 
 
 def test_unknown_and_lost_nodes_are_refused() -> None:

@@ -19,6 +19,7 @@ from meshctl.device.observation import (
     MeshNeighbor,
     RadioState,
     Space,
+    Station,
     WirelessLink,
 )
 from meshctl.errors import ExitCode, NodeError
@@ -60,6 +61,22 @@ def test_an_unreachable_deployed_node_is_shown_with_who_hears_it(fleet: Fleet) -
     alarm = alarms(status, "rover")["unreachable"]
     assert "last answered 10 min ago; b01 hears it (-60 dBm, 0.1 s ago)" in alarm.text
     assert status.exit_code is ExitCode.UNREACHABLE
+
+
+@pytest.mark.parametrize(
+    ("state", "inactive_ms", "is_seen"),
+    [("BLOCKED", 400, True), ("LISTEN", 400, True), ("BLOCKED", 60_000, False), ("ESTAB", 400, False)],
+)
+def test_a_node_with_another_key_is_not_looked_for_where_it_was(
+    fleet: Fleet, state: str, inactive_ms: int, is_seen: bool
+) -> None:
+    """Seen on real OpenWrt, after a change of the key that a node had missed: `no node hears it`, check its power."""
+    station = Station("mesh0", MACS["rover"], signal_dbm=-60, inactive_ms=inactive_ms, mesh_link=state)
+    answered = {"base": HEALTHY["base"], "b01": seen("b01", {"base": 250}, stations=(station,))}
+    known = {"rover": LastKnown("rover", NOW - 600, {"hops": "2", "via": "b01"})}
+    alarm = alarms(status_of(fleet, answered, known=known), "rover")["unreachable"]
+    assert ("b01 hears it (-60 dBm, 0.4 s ago), but their 802.11s link does not come up" in alarm.text) is is_seen
+    assert ("--leave-behind all" in alarm.hint) is is_seen
 
 
 def test_an_unreachable_node_is_reported_with_its_last_position(fleet: Fleet) -> None:
