@@ -71,8 +71,9 @@ def test_each_audible_pair_is_linked_exactly_once(ground: RadioEnvironment) -> N
     for link in found:
         losses = (link.loss_to(link.a), link.loss_to(link.b))
         if link.ends not in by_hand:
-            assert min(losses) < DEAF_LOSS
-            assert all(loss < DEAF_LOSS or loss == 1.0 for loss in losses)
+            # in hundredths: 0.896 is 0.9
+            assert min(losses) <= DEAF_LOSS
+            assert all(loss <= DEAF_LOSS or loss == 1.0 for loss in losses)
 
 
 @given(grounds)
