@@ -240,6 +240,8 @@ def _simultaneous_stage(
     if failed:
         what = "the mesh change" if stage.kind is StageKind.SWITCH else "the simultaneous change"
         reason = f"{what} was canceled: packages could not be installed on {', '.join(failed)}"
+        if all(outcome.result is Result.PENDING for outcome in failed.values()):
+            reason = f"{what} was canceled: interrupted"
         ended = {name: failed.get(name) or Outcome(name, Result.PENDING, reason) for name in stage.nodes}
     else:
         with_files = [name for name in stage.nodes if contexts[name].plan.reloads]
@@ -285,6 +287,9 @@ def _packages_first(stage: Stage, contexts: Mapping[str, NodeContext]) -> dict[s
         step = contexts[name].plan.packages
         if step is None:
             continue
+        if contexts[name].run.interrupt.stopping:
+            failed[name] = Outcome(name, Result.PENDING, "interrupted before its packages were installed")
+            break
         try:
             outcome = install(contexts[name], _connection(contexts[name]), step)
         except NodeError as error:

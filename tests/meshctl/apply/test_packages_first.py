@@ -14,6 +14,34 @@ from meshctl.fleet.events import silent
 from meshctl.plan import PackageStep, Stage, StageKind
 
 
+def _switched(names: tuple[str, ...], interrupt: object) -> dict[str, Outcome]:
+    """A mesh change of these nodes, each with a package."""
+    plan: Any = SimpleNamespace(packages=PackageStep(("iw",), ("iw.apk",)))
+    run = SimpleNamespace(interrupt=interrupt)
+    contexts: Any = {name: SimpleNamespace(name=name, plan=plan, run=run) for name in names}
+    unused: Any = None
+    return executor._simultaneous_stage(
+        Stage(StageKind.SWITCH, tuple(contexts), "", mesh="main"), contexts, unused, unused, silent
+    )
+
+
+def test_an_interrupt_during_the_installations_cancels_the_change(monkeypatch: pytest.MonkeyPatch) -> None:
+    interrupt = SimpleNamespace(stopping=False)
+
+    def install(ctx: Any, *_rest: object) -> Outcome:
+        interrupt.stopping = True
+        return Outcome(ctx.name, Result.DONE)
+
+    monkeypatch.setattr(executor, "install", install)
+    monkeypatch.setattr(executor, "_connection", lambda _ctx: None)
+    ended = _switched(("b02", "b01", "base"), interrupt)
+    assert {name: (outcome.result, outcome.reason) for name, outcome in ended.items()} == {
+        "b02": (Result.PENDING, "the mesh change was canceled: interrupted"),
+        "b01": (Result.PENDING, "interrupted before its packages were installed"),
+        "base": (Result.PENDING, "the mesh change was canceled: interrupted"),
+    }
+
+
 def test_a_failed_installation_is_not_repeated_on_the_other_nodes(monkeypatch: pytest.MonkeyPatch) -> None:
     """The change is canceled on all. Seen on real OpenWrt: each node in turn left the mesh until its window ended."""
     asked = []
@@ -24,11 +52,7 @@ def test_a_failed_installation_is_not_repeated_on_the_other_nodes(monkeypatch: p
 
     monkeypatch.setattr(executor, "install", install)
     monkeypatch.setattr(executor, "_connection", lambda _ctx: None)
-    plan: Any = SimpleNamespace(packages=PackageStep(("iw",), ("iw.apk",)))
-    contexts: Any = {name: SimpleNamespace(name=name, plan=plan) for name in ("b02", "b01", "base")}
-    stage = Stage(StageKind.SWITCH, tuple(contexts), "", mesh="main")
-    unused: Any = None
-    ended = executor._simultaneous_stage(stage, contexts, unused, unused, silent)
+    ended = _switched(("b02", "b01", "base"), SimpleNamespace(stopping=False))
     assert asked == ["b02"]
     assert {name: outcome.result for name, outcome in ended.items()} == {
         "b02": Result.ROLLED_BACK,
