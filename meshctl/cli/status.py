@@ -86,7 +86,7 @@ def status(
         echo_json(json.dumps(query.answers()))
         return
     if watch is None:
-        found = query.status(query.collect(), time.time())
+        found = query.latest()
         if as_json:
             echo_json(json.dumps(status_json(found), indent=2))
         else:
@@ -111,11 +111,18 @@ class _StatusQuery:
 
     def collect(self, *, show_progress: bool = True) -> Snapshot:
         """Take a snapshot and record it in the journal; `show_progress` counts answers on a terminal."""
+        return self._collected(show_progress=show_progress)[0]
+
+    def latest(self) -> FleetStatus:
+        """The same, and the status of the selected devices in it."""
+        return self._chosen.apply(self._collected(show_progress=True)[1])
+
+    def _collected(self, *, show_progress: bool) -> tuple[Snapshot, FleetStatus]:
         snapshot = collect(self._fleet_view, self._nodes, self._robots, show_progress=show_progress)
         snapshot = replace(snapshot, is_partial=self._is_partial)
         whole = assess(snapshot, self._nodes, time.time(), self._robots)
         self._fleet_view.opened.journal.remember_all(self._fleet_view.fleet.name, facts_to_record(whole), time.time())
-        return snapshot
+        return snapshot, whole
 
     def answers(self) -> dict[str, object]:
         """The nodes' answers, for the operator that queried a site's worker."""
@@ -137,7 +144,7 @@ def _follow(query: _StatusQuery, period_s: float, as_json: bool) -> None:
     """Repeated snapshots for pipes and logs: JSON lines, or text blocks separated by blank lines."""
     while True:
         began = time.monotonic()
-        found = query.status(query.collect(), time.time())
+        found = query.latest()
         if as_json:
             echo_json(json.dumps(status_json(found)))
         else:
