@@ -46,7 +46,7 @@ from meshctl.plan.saved import dump, load
 
 NoFirmware = Annotated[bool, typer.Option("--no-firmware", help="Do not upgrade firmware.")]
 LeaveBehind = Annotated[
-    str,
+    list[str] | None,
     typer.Option(
         "--leave-behind",
         metavar="NODES",
@@ -54,7 +54,7 @@ LeaveBehind = Annotated[
     ),
 ]
 AcceptCut = Annotated[
-    str,
+    list[str] | None,
     typer.Option(
         "--accept-cut", metavar="NODES", help="Cut vertices ('b07,group:relays', @FILE, all) to flash anyway."
     ),
@@ -89,8 +89,8 @@ def plan(
     ] = None,
     no_firmware: NoFirmware = False,
     together: Together = False,
-    leave_behind: LeaveBehind = "",
-    accept_cut: AcceptCut = "",
+    leave_behind: LeaveBehind = None,
+    accept_cut: AcceptCut = None,
     direct: Direct = False,
     reconnect: Reconnect = False,
     brief: Brief = False,
@@ -175,8 +175,8 @@ def provision(
     yes: Yes = False,
     no_firmware: NoFirmware = False,
     together: Together = False,
-    leave_behind: LeaveBehind = "",
-    accept_cut: AcceptCut = "",
+    leave_behind: LeaveBehind = None,
+    accept_cut: AcceptCut = None,
     direct: Direct = False,
     rate: Rate = None,
     brief: Brief = False,
@@ -216,8 +216,8 @@ def resume(
             help="All nodes simultaneously, or stage by stage; default: as in the original run.",
         ),
     ] = None,
-    leave_behind: LeaveBehind = "",
-    accept_cut: AcceptCut = "",
+    leave_behind: LeaveBehind = None,
+    accept_cut: AcceptCut = None,
     direct: Direct = False,
     rate: Rate = None,
     brief: Brief = False,

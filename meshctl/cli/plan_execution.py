@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import secrets
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
@@ -44,16 +44,20 @@ class PlanRefused(MeshctlError):
 
 
 def choices_of(
-    fleet: Fleet, no_firmware: bool, leave_behind: str, accept_cut: str, together: bool = False
+    fleet: Fleet,
+    no_firmware: bool,
+    leave_behind: Sequence[str] | None,
+    accept_cut: Sequence[str] | None,
+    together: bool = False,
 ) -> PlanOptions:
     """Raises InputError for a word that selects no node."""
-    left, cut = (_acknowledged(fleet, text) for text in (leave_behind, accept_cut))
+    left, cut = (_acknowledged(fleet, given or ()) for given in (leave_behind, accept_cut))
     return PlanOptions(not no_firmware, left, cut, together=together)
 
 
-def _acknowledged(fleet: Fleet, text: str) -> tuple[str, ...]:
-    """The nodes that an option selects, or `all`."""
-    words = tuple(part.strip() for part in text.split(",") if part.strip())
+def _acknowledged(fleet: Fleet, given: Sequence[str]) -> tuple[str, ...]:
+    """The nodes that an option selects, however often it is given, or `all`."""
+    words = tuple(part.strip() for text in given for part in text.split(",") if part.strip())
     if not words or ALL in words or runs_at_site():
         # a site gets names, also those of other sites, which its part of the inventory may lack
         return (ALL,) if ALL in words else words
