@@ -28,6 +28,7 @@ from benchmarks.model_node.chain import chain_sections
 from benchmarks.model_node.node import (
     LOGIN_S,
     READER,
+    Cost,
     Node,
     UnknownCommand,
     recorded_costs,
@@ -53,12 +54,12 @@ class _Command:
 
 
 class _Server:
-    def __init__(self, directory: Path) -> None:
+    def __init__(self, directory: Path, costs: dict[str, Cost], sections: dict[str, tuple[str, str]]) -> None:
         self.directory = directory
         self.selector = selectors.DefaultSelector()
         self.due: list[tuple[float, int, Callable[[], None]]] = []
         self.number = 0
-        costs, sections, now_s = recorded_costs(), recorded_sections(), time.monotonic()
+        now_s = time.monotonic()
         self.nodes: dict[str, Node] = {}
         self.pipes: dict[str, int] = {}
         self.in_work: set[str] = set()
@@ -180,6 +181,8 @@ def _unframed(command: str, given: bytes) -> tuple[str, bytes]:
 
 def main() -> None:
     directory = Path(sys.argv[1])
+    # before /root is another one: the repository may be there
+    costs, sections = recorded_costs(), recorded_sections()
     if os.geteuid() != 0:
         ns.enter_user_namespace()
     ns.unshare(ns.CLONE_NEWNS)
@@ -188,7 +191,7 @@ def main() -> None:
         ns.accept_setgroups()
     ns.bind(str(directory / "root"), "/root")
     ns.bind(str(directory / "passwd"), "/etc/passwd")
-    _Server(directory).serve()
+    _Server(directory, costs, sections).serve()
 
 
 def _is_user_namespace() -> bool:
