@@ -36,8 +36,9 @@ def test_peer_names_resolve_on_a_robot_while_its_daemon_runs(fleet: RobotFleet) 
     fleet.shell("husky1", "sed -i '/10.9.9.9/d' /etc/hosts")
     eventually(lambda: _address_of(fleet, "husky2", on="husky1") == husky2)
 
-    # killed and not started again, it leaves no names
-    fleet.shell("husky1", "systemctl kill -s KILL udp-mesh-hosts && systemctl stop udp-mesh-hosts")
+    # killed and not started again, it leaves no names; `systemctl kill` would also kill what removes them (systemd 257)
+    main_process = "$(systemctl show -p MainPID --value udp-mesh-hosts)"
+    fleet.shell("husky1", f"kill -s KILL {main_process} && systemctl stop udp-mesh-hosts")
     assert fleet.shell("husky1", "cat /etc/hosts") == before
     fleet.shell("husky1", "systemctl start udp-mesh-hosts")
 
