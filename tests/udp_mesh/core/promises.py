@@ -26,6 +26,7 @@ from tests.udp_mesh.core.random_teams import LOG, Broken, RandomTeam
 from tests.udp_mesh.core.taken_once import effects_watched
 from udp_mesh.core import transmit
 from udp_mesh.core.interfaces import Datagram
+from udp_mesh.core.legacy.acks import MAX_BEHIND, WINDOW
 from udp_mesh.core.peers.session import Peer
 from udp_mesh.core.receiver.reassembly import RELIABLE_TIMEOUT_S
 from udp_mesh.core.sender.message import OutgoingMessage
@@ -41,6 +42,8 @@ from udp_mesh.core.thin.outgoing import LIFE_S
 MAX_STEPS_PER_S = 60_000
 """Datagrams, timers and calls of all nodes in a second of virtual time: more is a loop."""
 MAX_IDLE_DATAGRAMS_PER_S, MAX_IDLE_WAKEUPS_PER_S = 15, 40
+MAX_LEGACY_ACKS_PER_S = WINDOW * MAX_BEHIND + WINDOW * (WINDOW + 1) // 2
+"""Each heartbeat of a legacy peer is answered for the fragments expected next, of messages that it gave up too."""
 # a message to a peer that only thin links reach may wait there for its whole life
 SETTLE_S, LEAST_BYTES_PER_S = LIFE_S + 5.0, 15_000
 """After the repair everything ends within this time, and what waits at that rate: more than one round of offline, lost
@@ -133,9 +136,11 @@ def check_finished(team: RandomTeam) -> None:
     end = team.now + 10.0
     while team.event_queue.step(end):
         steps += 1
-    for name in team.nodes:
+    for name, node in team.nodes.items():
         sent = team.datagrams[name] - before[name]
-        if sent > 10 * MAX_IDLE_DATAGRAMS_PER_S * len(team.homes[name]):
+        legacy_peers = sum(peer.legacy for peer in node._state.peer_table.peers.values())
+        idle_per_s = MAX_IDLE_DATAGRAMS_PER_S * len(team.homes[name]) + MAX_LEGACY_ACKS_PER_S * legacy_peers
+        if sent > 10 * idle_per_s:
             raise Broken(f"{name} sends {sent / 10:.0f} datagrams a second although it has nothing to send")
         if (woken := team.wakeups[name] - wakeups[name]) > 10 * MAX_IDLE_WAKEUPS_PER_S:
             raise Broken(f"{name} wakes {woken / 10:.0f} times a second although there is nothing to do")
