@@ -87,7 +87,7 @@ def _reaches(ordered: list[tuple[str, FixedPosition]], index: int, step: int, pl
         there = ordered[other][1]
         if abs(there.x_m - place.x_m) > MAX_LINK_M:
             return False
-        if math.hypot(there.x_m - place.x_m, there.y_m - place.y_m) <= MAX_LINK_M:
+        if _apart_m(place, there) <= MAX_LINK_M:
             return True
         other += step
     return False
@@ -134,26 +134,67 @@ _Placed = list[tuple[str, FixedPosition]]
 def _gaps(placed: _Placed, reach_m: float) -> list[tuple[float, list[str], tuple[str, str]]]:
     """The clusters of nodes within reach of each other, but for the largest: the distance to the nearest other
     cluster, the nodes, and the two nodes nearest to each other; the widest gap first."""
-    left, clusters = dict(placed), []
-    while left:
-        cluster = [left.popitem()]
-        # grows while it is read
-        for _, place in cluster:
-            within = [(name, there) for name, there in left.items() if _apart_m(place, there) <= reach_m]
-            for name, _ in within:
-                del left[name]
-            cluster += within
-        clusters.append(cluster)
-    clusters.sort(key=len)
+    clusters = sorted(_clusters(placed, reach_m), key=len)
+    if len(clusters) < 2:
+        return []
+    # by x, so that each is compared with its surroundings alone
+    ordered = sorted(placed, key=lambda item: item[1].x_m)
+    place_of = {name: place for place, (name, _) in enumerate(ordered)}
     found = []
     for cluster in clusters[:-1]:
         inside = {name for name, _ in cluster}
-        outside = [item for item in placed if item[0] not in inside]
-        gap_m, near, far = min(
-            (_apart_m(place, there), name, other) for name, place in cluster for other, there in outside
-        )
+        gap_m, near, far = min(_nearest(ordered, place_of[name], inside) for name, _ in cluster)
         found.append((gap_m, [name for name, _ in cluster], (near, far)))
     return sorted(found, reverse=True)
+
+
+def _clusters(placed: _Placed, reach_m: float) -> list[_Placed]:
+    """The nodes that are connected by links of at most `reach_m`, looked for in squares of that size."""
+    squares: dict[tuple[int, int], dict[str, FixedPosition]] = {}
+    for name, place in placed:
+        squares.setdefault(_square(place, reach_m), {})[name] = place
+    number = {name: place for place, (name, _) in enumerate(placed)}
+    clusters, taken = [], set[str]()
+    for first in reversed(placed):
+        if first[0] in taken:
+            continue
+        taken.add(first[0])
+        del squares[_square(first[1], reach_m)][first[0]]
+        cluster = [first]
+        # grows while it is read
+        for _, place in cluster:
+            column, row = _square(place, reach_m)
+            within = [
+                (name, there)
+                for x in (column - 1, column, column + 1)
+                for y in (row - 1, row, row + 1)
+                for name, there in squares.get((x, y), {}).items()
+                if _apart_m(place, there) <= reach_m
+            ]
+            for name, there in within:
+                taken.add(name)
+                del squares[_square(there, reach_m)][name]
+            cluster += sorted(within, key=lambda item: number[item[0]])
+        clusters.append(cluster)
+    return clusters
+
+
+def _square(place: FixedPosition, size_m: float) -> tuple[int, int]:
+    return math.floor(place.x_m / size_m), math.floor(place.y_m / size_m)
+
+
+def _nearest(ordered: _Placed, index: int, inside: set[str]) -> tuple[float, str, str]:
+    """The distance to the nearest node that is not `inside`, this node, and that one."""
+    name, place = ordered[index]
+    best = (math.inf, name, "")
+    for step in (-1, 1):
+        other = index + step
+        while 0 <= other < len(ordered) and abs(ordered[other][1].x_m - place.x_m) <= best[0]:
+            far, there = ordered[other]
+            if far not in inside:
+                best = min(best, (_apart_m(place, there), name, far))
+            other += step
+    return best
 
 
 def _apart_m(place: FixedPosition, there: FixedPosition) -> float:
