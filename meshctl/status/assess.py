@@ -75,6 +75,8 @@ def assess(snapshot: Snapshot, nodes: Iterable[Node], now: float, robots: Iterab
     reports = snapshot.reports
     sightings = seen_by(reports.values(), snapshot.macs)
     refusals = _refusals(snapshot)
+    names = set(snapshot.macs.values()) | set(snapshot.observations) | set(snapshot.fleet.nodes)
+    formers = _formers_in_mesh(snapshot, names)
     paths = {} if snapshot.is_partial else snapshot.graph.paths_to_any(snapshot.entries)
     cut_off_by = {} if snapshot.is_partial else snapshot.graph.cut_off_by_any(snapshot.entries)
     entry_by_site = snapshot.entry_by_site
@@ -88,8 +90,9 @@ def assess(snapshot: Snapshot, nodes: Iterable[Node], now: float, robots: Iterab
     for node in nodes:
         observation = snapshot.observations.get(node.name)
         if observation is None:
-            refused_by = refusals.get(node.name, ())
-            statuses.append(_unreachable_status(snapshot, node, sightings.get(node.name, ()), now, refused_by))
+            heard_by, refused_by = sightings.get(node.name, ()), refusals.get(node.name, ())
+            has_former = node.name in formers.values()
+            statuses.append(_unreachable_status(snapshot, node, heard_by, now, refused_by, has_former=has_former))
             continue
         last = snapshot.known.get(node.name)
         # the robot that carries a beacon, and its rack, may use it as a relay while it is on board
@@ -116,8 +119,6 @@ def assess(snapshot: Snapshot, nodes: Iterable[Node], now: float, robots: Iterab
         statuses.append(_reachable_status(everything, now))
     if not snapshot.is_partial:
         statuses = _with_dropped(snapshot.fleet, statuses)
-    names = _known_names(snapshot)
-    formers = _formers_in_mesh(snapshot)
     strangers = tuple(name for name in snapshot.graph.nodes if name not in names | formers.keys())
     robot_answers = RobotAnswers(
         snapshot.fleet, snapshot.robots, snapshot.no_answer_robots, snapshot.known, now, frozenset(snapshot.unrendered)
@@ -159,13 +160,9 @@ def _fleet_alarms(snapshot: Snapshot) -> Iterable[Alarm]:
         yield Alarm(Level.NOTE, "robots-unasked", snapshot.robots_skipped)
 
 
-def _known_names(snapshot: Snapshot) -> set[str]:
-    return set(snapshot.macs.values()) | set(snapshot.observations) | set(snapshot.fleet.nodes)
-
-
-def _formers_in_mesh(snapshot: Snapshot) -> dict[str, str]:
-    """MAC -> the node that the device was, of each former device that is in the mesh."""
-    formers, names = former_devices(snapshot.known), _known_names(snapshot)
+def _formers_in_mesh(snapshot: Snapshot, names: set[str]) -> dict[str, str]:
+    """MAC -> the node that the device was, of each former device that is in the mesh and is not one of `names`."""
+    formers = former_devices(snapshot.known)
     return {mac: formers[mac] for mac in snapshot.graph.nodes if mac in formers and mac not in names}
 
 
@@ -215,7 +212,10 @@ def _unreachable_status(
     heard_by: tuple[Sighting, ...],
     now: float,
     refused_by: tuple[Sighting, ...],
+    *,
+    has_former: bool,
 ) -> NodeStatus:
+    """`has_former`: the device that it replaced is in the mesh."""
     last = snapshot.known.get(node.name)
     why = snapshot.no_answer.get(node.name, NOT_ASKED)
     is_required = node.state is NodeState.DEPLOYED
@@ -229,7 +229,7 @@ def _unreachable_status(
         first_contact_hint=f"if it is not set up yet: meshctl bootstrap {node.name}",
         refused_by=refused_by,
     )
-    if alarm is not None and why.code == "host-key" and node.name in _formers_in_mesh(snapshot).values():
+    if alarm is not None and why.code == "host-key" and has_former:
         alarm = replace(
             alarm, hint=f"the former device of {node.name} may answer in its place: switch that one off first"
         )
