@@ -55,23 +55,26 @@ def with_settings(text: str, settings: Settings, file: str, named: frozenset[str
     mistake, while a missing key elsewhere has a default. Raises SweepError with file, line, expected and found.
     """
     edited = EditedText(text)
+    node = compose(text) if settings else None
     for path, value in settings:
-        edited = _with_setting(edited, path, value, file, named)
+        edited = _with_setting(edited, node, path, value, file, named)
         try:
-            compose(edited.text)
+            node = compose(edited.text)
         except yaml.YAMLError as error:
             # `-` and `a: b` are values in a list, as which they were checked, and not here
             raise SweepError(f"--set {path}={value}: expected one YAML value, found {value!r}") from error
     return edited
 
 
-def _with_setting(edited: EditedText, path: str, value: str, file: str, named: frozenset[str]) -> EditedText:
+def _with_setting(
+    edited: EditedText, node: yaml.Node | None, path: str, value: str, file: str, named: frozenset[str]
+) -> EditedText:
+    """`node` is the tree of the edited text."""
     steps = steps_of(path)
     where = f"--set {path}={value}"
     if not steps:
         raise SweepError(f"{where}: expected a path such as air.range_m or flows[0].size_bytes, found {path!r}")
     _check_value(value, where)
-    node = compose(edited.text)
     if not isinstance(node, yaml.MappingNode):
         raise SweepError(f"{file}:1: {where}: expected a mapping, found none")
     walked = ""
