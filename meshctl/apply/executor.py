@@ -98,6 +98,7 @@ def unflushed_since(prepared: Prepared, journal: Journal) -> dict[str, float]:
     return {name: at_s for name, at_s in since_s.items() if name in prepared.plan.nodes and name in observations}
 
 
+# batman-adv's loop avoidance (30 s), and a radio that comes up slowly
 _RECONNECT_S = 90.0
 # Results of a node that was in progress and is unreachable now.
 _LOST = (Result.UNCERTAIN, Result.UNREACHABLE)
@@ -237,12 +238,12 @@ def _simultaneous_stage(
     for name in stage.nodes:
         observer(Event(EventKind.STARTED, name, time.time()))
     failed = _packages_first(stage, contexts)
-    if failed:
+    if failed is not None:
         what = "the mesh change" if stage.kind is StageKind.SWITCH else "the simultaneous change"
-        reason = f"{what} was canceled: packages could not be installed on {', '.join(failed)}"
-        if all(outcome.result is Result.PENDING for outcome in failed.values()):
-            reason = f"{what} was canceled: interrupted"
-        ended = {name: failed.get(name) or Outcome(name, Result.PENDING, reason) for name in stage.nodes}
+        is_interrupted = failed.result is Result.PENDING
+        why = "interrupted" if is_interrupted else f"packages could not be installed on {failed.node}"
+        ended = {name: Outcome(name, Result.PENDING, f"{what} was canceled: {why}") for name in stage.nodes}
+        ended[failed.node] = failed
     else:
         with_files = [name for name in stage.nodes if contexts[name].plan.reloads]
         ended = {name: Outcome(name, Result.DONE) for name in stage.nodes}
@@ -281,21 +282,19 @@ def _connect_again(contexts: Iterable[NodeContext]) -> None:
                 ctx.run.interrupt.wait(1.0)
 
 
-def _packages_first(stage: Stage, contexts: Mapping[str, NodeContext]) -> dict[str, Outcome]:
-    failed: dict[str, Outcome] = {}
+def _packages_first(stage: Stage, contexts: Mapping[str, NodeContext]) -> Outcome | None:
+    """The outcome of the first node whose packages were not installed: the change is canceled on all, so the others
+    keep their packages, too."""
     for name in stage.nodes:
         step = contexts[name].plan.packages
         if step is None:
             continue
         if contexts[name].run.interrupt.stopping:
-            failed[name] = Outcome(name, Result.PENDING, "interrupted before its packages were installed")
-            break
+            return Outcome(name, Result.PENDING, "interrupted before its packages were installed")
         try:
             outcome = install(contexts[name], _connection(contexts[name]), step)
         except NodeError as error:
             outcome = outcome_of_error(name, error)
         if not outcome.result.is_good:
-            # the change is canceled on all, so the others keep their packages, too
-            failed[name] = outcome
-            break
-    return failed
+            return outcome
+    return None

@@ -83,7 +83,7 @@ def test_after_another_supplicant_the_nodes_are_connected_again_first(monkeypatc
     fleet = SimpleNamespace(apply=SimpleNamespace(quorum=1.0, parallel=1))
     run: Any = SimpleNamespace(connections=pool, interrupt=interrupt, fleet=fleet)
     step = PackageStep(("wpad-openssl",), ("wpad-openssl.apk",), ("wpad-basic",))
-    monkeypatch.setattr(executor, "_packages_first", lambda *_given: {})
+    monkeypatch.setattr(executor, "_packages_first", lambda *_given: None)
     monkeypatch.setattr(executor, "_connection", connection)
     monkeypatch.setattr(executor, "commit_mesh", commit)
     plan: Any = SimpleNamespace(packages=step, reloads=("wireless",), entries=("base",))
