@@ -133,7 +133,7 @@ def _refusal(
             else "fix the refused nodes, then plan again",
         )
     for mesh, names in found.left_behind.items():
-        # the option is given once, with all of them
+        # one option with all of them, also those that were given already
         needed = (*acknowledged, *names)
         few = len(needed) <= MAX_IN_FULL
         how = ",".join(needed) if few else "and what selects them ('group:far,state:carried', @FILE, or all)"
