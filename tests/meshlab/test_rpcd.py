@@ -63,6 +63,15 @@ def test_an_unconfirmed_apply_is_undone_with_whatever_was_written_since(node: Vi
     assert node.exec(f"ls -A {SNAPSHOT} 2>/dev/null").stdout == ""
 
 
+def test_no_call_is_answered_while_another_is_at_work(node: VirtualNode) -> None:
+    """As by one process: a node that no longer waits has its files back."""
+    at_work = "flock /var/run/rpcd.lock sh -c 'touch /tmp/at-work; sleep 3; echo done' >>/tmp/order &"
+    begun = "until [ -e /tmp/at-work ]; do sleep 1; done"
+    confirm = """ubus call uci confirm '{"ubus_rpc_session":"somebody"}' 2>/dev/null"""
+    order = node.exec(f"{at_work} {begun}; {confirm}; echo answered >>/tmp/order; cat /tmp/order").stdout
+    assert order.split() == ["done", "answered"]
+
+
 def test_an_apply_is_confirmed_by_its_own_session_alone(node: VirtualNode) -> None:
     session, other = log_in(node), log_in(node)
     is_new = node.name == "new"
