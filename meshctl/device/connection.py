@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 from base64 import b64encode
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from hashlib import sha256
 from pathlib import Path
@@ -150,3 +150,15 @@ class Connection(Protocol):
         ...
 
     def close(self) -> None: ...
+
+
+class KeepingConnection(Connection, Protocol):
+    """A connection on which scripts are kept for further runs."""
+
+    def run_kept(self, script: str, arguments: Sequence[str], *, timeout_s: float | None = None) -> Completed:
+        """Run a script with these arguments, without input or standard error; a shell on the node keeps the script for
+        the next time (`kept_script`).
+
+        Deadline and errors as in `run`; ValueError for an argument with a line break.
+        """
+        ...

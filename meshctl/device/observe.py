@@ -10,10 +10,11 @@ import secrets
 import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cache
 from types import MappingProxyType
 from typing import TypeVar
 
-from meshctl.device.connection import Connection
+from meshctl.device.connection import Connection, KeepingConnection
 from meshctl.device.framing import quoted
 from meshctl.device.observation import (
     BoardInfo,
@@ -56,20 +57,18 @@ class RawObservation:
         return interpret(sections, asked_at_s=self.asked_at_s, answered_at_s=self.answered_at_s)
 
 
-def observe_raw(
-    connection: Connection,
+def observe_again(
+    connection: KeepingConnection,
     *,
     extra_paths: Iterable[str] = (),
-    brief: bool = False,
     timeout_s: float = OBSERVE_TIMEOUT_S,
     clock: Callable[[], float] = time.time,
 ) -> RawObservation:
-    """One round trip for everything about the node; `extra_paths` are further files to read. `brief` leaves out what no
-    proof of a change needs. Raises Timeout and ConnectionLost."""
-    nonce = f"meshctl-{secrets.token_hex(16)}"
-    sent = observation_script(nonce, extra_paths, brief=brief)
+    """One round trip for everything about the node, for those who look at it again and again: it keeps the script.
+    `extra_paths` are further files to read. Raises Timeout and ConnectionLost."""
+    nonce = _nonce()
     asked = clock()
-    done = connection.run(sent, timeout_s=timeout_s)
+    done = connection.run_kept(_kept_script(), (nonce, *_checked(extra_paths)), timeout_s=timeout_s)
     return RawObservation(nonce, done.stdout_bytes, asked, clock())
 
 
@@ -81,18 +80,36 @@ def observe(
     timeout_s: float = OBSERVE_TIMEOUT_S,
     clock: Callable[[], float] = time.time,
 ) -> Observation:
-    """`observe_raw`, parsed; a missing or unreadable answer is data."""
-    return observe_raw(connection, extra_paths=extra_paths, brief=brief, timeout_s=timeout_s, clock=clock).interpret()
+    """One round trip for everything about the node, parsed; a missing or unreadable answer is data. `extra_paths` are
+    further files to read; `brief` leaves out what no proof of a change needs. Raises Timeout and ConnectionLost."""
+    nonce = _nonce()
+    asked = clock()
+    done = connection.run(observation_script(nonce, extra_paths, brief=brief), timeout_s=timeout_s)
+    return RawObservation(nonce, done.stdout_bytes, asked, clock()).interpret()
 
 
 def observation_script(nonce: str, extra_paths: Iterable[str] = (), *, brief: bool = False) -> str:
     """observe.sh with its inputs set. Raises ValueError for a path with blanks or quotes."""
+    values = {"N": nonce, "EXTRA": " ".join(_checked(extra_paths)), "BRIEF": "yes" if brief else ""}
+    return "\n".join([*(f"{name}={quoted(value)}" for name, value in values.items()), code("observe.sh")])
+
+
+@cache
+def _kept_script() -> str:
+    """observe.sh with its inputs as arguments: the nonce and the further paths."""
+    return f'N=$1\nshift\nEXTRA="$*"\nBRIEF=\n{code("observe.sh")}'
+
+
+def _nonce() -> str:
+    return f"meshctl-{secrets.token_hex(16)}"
+
+
+def _checked(extra_paths: Iterable[str]) -> tuple[str, ...]:
     paths = tuple(extra_paths)
     for path in paths:
         if not path.startswith("/") or quoted(path) != path:
             raise ValueError(f"{path!r}: expected an absolute path of letters, digits and ._+@%:,-")
-    values = {"N": nonce, "EXTRA": " ".join(paths), "BRIEF": "yes" if brief else ""}
-    return "\n".join([*(f"{name}={quoted(value)}" for name, value in values.items()), code("observe.sh")])
+    return paths
 
 
 class _OutputReader:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from functools import partial
 from types import TracebackType
@@ -29,7 +29,8 @@ from meshctl.device.errors import (
     Timeout,
     Unreachable,
 )
-from meshctl.device.framing import framed
+from meshctl.device.framing import framed, quoted
+from meshctl.device.kept_script import KeptScript
 from meshctl.device.legacy_rsa import SSH_RSA, LegacyTransport
 from meshctl.device.liveness import ActivityStream, Watchdog, keepalives
 from meshctl.device.sockets import open_socket
@@ -236,6 +237,7 @@ class SshConnection(Connection):
         self._transport = transport
         self._limits = limits
         self._activity = activity
+        self._kept: dict[str, KeptScript] = {}
 
     @property
     def endpoint(self) -> Endpoint:
@@ -266,9 +268,15 @@ class SshConnection(Connection):
                 raise Unreachable(f"{target.label}: {self._endpoint.label} cannot reach it: {error.text}") from error
 
     def run(self, script: str, *, stdin: bytes | Iterable[bytes] = b"", timeout_s: float | None = None) -> Completed:
+        return self._recorded(script, partial(self._run, script, stdin, timeout_s))
+
+    def run_kept(self, script: str, arguments: Sequence[str], *, timeout_s: float | None = None) -> Completed:
+        return self._recorded(quoted("run", *arguments), partial(self._run_kept, script, arguments, timeout_s))
+
+    def _recorded(self, script: str, run: Callable[[], Completed]) -> Completed:
         began = time.monotonic()
         try:
-            done = self._run(script, stdin, timeout_s)
+            done = run()
         except MeshctlError as error:
             self._record(script, began, error=str(error))
             raise
@@ -302,6 +310,23 @@ class SshConnection(Connection):
                 with ignoring_closed():
                     channel.close()
         return Completed(out, err, status)
+
+    def _run_kept(self, script: str, arguments: Sequence[str], timeout_s: float | None) -> Completed:
+        seconds = self._limits.run_s if timeout_s is None else timeout_s
+        kept = self._kept.pop(script, None)
+        with keepalives(self._transport, self._limits.ask_s, self._limits.keepalive_s):
+            if kept is None or not kept.is_open:
+                with self._waiting(min(seconds, self._limits.channel_s), "opening a channel"):
+                    kept = KeptScript.start(open_session(self._transport), self._endpoint.label, script)
+            try:
+                with self._waiting(seconds, "a command"):
+                    done = kept.run(arguments)
+            except BaseException:
+                with ignoring_closed():
+                    kept.close()
+                raise
+        self._kept[script] = kept
+        return done
 
     def stream(self, command: str) -> LineStream:
         """Start a command that exchanges lines with us until either side ends it. Raises Timeout, ConnectionLost."""

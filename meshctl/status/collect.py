@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 from meshctl.apply.prepare import other_paths
 from meshctl.device.observation import Observation
-from meshctl.device.observe import RawObservation, observe_raw
+from meshctl.device.observe import RawObservation, observe_again
 from meshctl.errors import MeshctlError, NodeError, Unreachable
 from meshctl.fleet.journal import ROBOT_PREFIX, Journal
 from meshctl.model import Fleet, Node
@@ -223,7 +223,7 @@ class Collector:
         desired = self._desired_state(node)
         paths = () if isinstance(desired, str) else other_paths(desired)
         with self.access.borrow(node) as connection:
-            return observe_raw(connection, extra_paths=paths, timeout_s=OBSERVE_S)
+            return observe_again(connection, extra_paths=paths, timeout_s=OBSERVE_S)
 
     def _observe(self, node: Node) -> Observation:
         return self._observe_raw(node).interpret()

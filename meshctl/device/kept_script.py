@@ -1,0 +1,73 @@
+"""A script that a shell on the node reads once and then runs again and again, with other arguments.
+
+`SshConnection.run_kept` starts the shell (`start`). It reads the script, then a line for each run: a mark, and the
+script's arguments. It runs the script in a subshell, without input, and prints the mark and the exit status after its
+output (`run`). To query a node every few seconds takes some tens of bytes then instead of the script, and the node
+starts no shell and parses nothing. The shell ends with its standard input, that is with the connection.
+"""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import Sequence
+
+import paramiko
+
+from meshctl.device.connection import Completed
+from meshctl.device.errors import OutputTooLarge
+from meshctl.device.framing import framed, quoted
+from meshctl.device.ssh_channel import MAX_OUTPUT_BYTES
+
+_READ_BYTES = 32 << 10
+# Its standard error is not read, and would fill the channel.
+_LOOP = """\
+run() (
+{script}
+)
+while read -r mark words; do
+	eval "run $words" </dev/null 2>/dev/null
+	echo "$mark $?"
+done
+"""
+
+
+class KeptScript:
+    """One such shell, in a channel of its own. Not thread-safe."""
+
+    def __init__(self, channel: paramiko.Channel, label: str) -> None:
+        self._channel = channel
+        self._label = label
+
+    @classmethod
+    def start(cls, channel: paramiko.Channel, label: str, script: str) -> KeptScript:
+        """Send the script. Raises what paramiko raises."""
+        sent = framed(_LOOP.format(script=script))
+        channel.exec_command(sent.command)
+        channel.sendall(sent.preamble)
+        return cls(channel, label)
+
+    @property
+    def is_open(self) -> bool:
+        return not (self._channel.closed or self._channel.eof_received)
+
+    def run(self, arguments: Sequence[str]) -> Completed:
+        """Run the script with these arguments; it has no standard error. Raises what paramiko raises, EOFError if the
+        shell ends, OutputTooLarge, and ValueError for an argument with a line break."""
+        mark = f"ended-{secrets.token_hex(16)}"
+        line = f"{mark} {quoted(*arguments)}\n"
+        if line.count("\n") > 1:
+            raise ValueError("a line break in an argument")
+        self._channel.sendall(line.encode())
+        output = bytearray()
+        end = f"{mark} ".encode()
+        while not output.endswith(b"\n") or (at := output.rfind(end, -len(end) - 4)) < 0:
+            data = self._channel.recv(_READ_BYTES)
+            if not data:
+                raise EOFError("the node's shell ended")
+            output += data
+            if len(output) > MAX_OUTPUT_BYTES:
+                raise OutputTooLarge(f"{self._label}: the command printed more than {MAX_OUTPUT_BYTES >> 20} MiB")
+        return Completed(bytes(output[:at]), b"", int(output[at + len(end) :]))
+
+    def close(self) -> None:
+        self._channel.close()
