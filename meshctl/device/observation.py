@@ -317,6 +317,7 @@ class Observation:
     mesh: MeshInfo | None = None
     neighbors: tuple[MeshNeighbor, ...] | None = None
     originators: tuple[Originator, ...] | None = None
+    """`observe_again` leaves out rows of a long table (near_originators in scripts/observe.sh)."""
     mesh_statistics: Mapping[str, Mapping[str, int]] | None = None
     """Interface of batman-adv -> its counters (`batctl statistics`)."""
     mesh_tables: Mapping[str, MeshTableSizes] | None = None

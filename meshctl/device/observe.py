@@ -64,8 +64,9 @@ def observe_again(
     timeout_s: float = OBSERVE_TIMEOUT_S,
     clock: Callable[[], float] = time.time,
 ) -> RawObservation:
-    """One round trip for everything about the node, for those who look at it again and again: it keeps the script.
-    `extra_paths` are further files to read. Raises Timeout and ConnectionLost."""
+    """One round trip for everything about the node, for those who look at it again and again: it keeps the script, and
+    of a long table of originators it sends the rows of neighbors alone. `extra_paths` are further files to read. Raises
+    Timeout and ConnectionLost."""
     nonce = _nonce()
     asked = clock()
     done = connection.run_kept(_kept_script(), (nonce, *_checked(extra_paths)), timeout_s=timeout_s)
@@ -90,14 +91,14 @@ def observe(
 
 def observation_script(nonce: str, extra_paths: Iterable[str] = (), *, brief: bool = False) -> str:
     """observe.sh with its inputs set. Raises ValueError for a path with blanks or quotes."""
-    values = {"N": nonce, "EXTRA": " ".join(_checked(extra_paths)), "BRIEF": "yes" if brief else ""}
+    values = {"N": nonce, "EXTRA": " ".join(_checked(extra_paths)), "BRIEF": "yes" if brief else "", "NEAR": ""}
     return "\n".join([*(f"{name}={quoted(value)}" for name, value in values.items()), code("observe.sh")])
 
 
 @cache
 def _kept_script() -> str:
     """observe.sh with its inputs as arguments: the nonce and the further paths."""
-    return f'N=$1\nshift\nEXTRA="$*"\nBRIEF=\n{code("observe.sh")}'
+    return f'N=$1\nshift\nEXTRA="$*"\nBRIEF=\nNEAR=yes\n{code("observe.sh")}'
 
 
 def _nonce() -> str:
@@ -305,7 +306,9 @@ def _mesh(
         neighbors = (neighbors or []) + list(near) if near is not None else neighbors
         originators = (originators or []) + list(far) if far is not None else originators
         tables[name] = _table_sizes(
-            far, reader.read(f"batctl.transglobal {name}", batctl.parse_transglobal, required=False)
+            far,
+            reader.read(f"batctl.originators_count {name}", batctl.parse_originators_count, required=False),
+            reader.read(f"batctl.transglobal {name}", batctl.parse_transglobal, required=False),
         )
     return (
         None if info is None else replace(info, hard_interfaces=_all(hard)),
@@ -321,15 +324,14 @@ def _all(lists: list[tuple[str, ...] | None]) -> tuple[str, ...] | None:
     return tuple(dict.fromkeys(name for names in known for name in names)) if len(known) == len(lists) else None
 
 
-def _table_sizes(paths: tuple[Originator, ...] | None, translations: tuple[int, int] | None) -> MeshTableSizes:
-    selected = None if paths is None else sum(path.best for path in paths)
-    unicast, multicast = translations or (None, None)
-    return MeshTableSizes(
-        originators_selected=selected,
-        originators_other=None if paths is None or selected is None else len(paths) - selected,
-        tg_unicast=unicast,
-        tg_multicast=multicast,
-    )
+def _table_sizes(
+    paths: tuple[Originator, ...] | None, counts: tuple[int, int] | None, translations: tuple[int, int] | None
+) -> MeshTableSizes:
+    """`counts` are those of the whole table, where `paths` are not all of it."""
+    if counts is None and paths is not None:
+        selected = sum(path.best for path in paths)
+        counts = (selected, len(paths) - selected)
+    return MeshTableSizes(*(counts or (None, None)), *(translations or (None, None)))
 
 
 def _statistics(reader: _OutputReader) -> Mapping[str, Mapping[str, int]] | None:

@@ -35,6 +35,12 @@ def parse_transglobal(text: str) -> tuple[int, int] | None:
     return (int(found[1]), int(found[2])) if found else None
 
 
+def parse_originators_count(text: str) -> tuple[int, int] | None:
+    """Counts of `originators_json` by observe.sh, where it left out rows: paths in use, and others."""
+    found = re.fullmatch(r"(\d{1,9}) (\d{1,9})\s*", text)
+    return (int(found[1]), int(found[2])) if found else None
+
+
 def parse_mesh_json(text: str) -> MeshInfo | None:
     """`mesh_json`: version, algorithm and every setting as text."""
     data = mapping(parse_json(text))

@@ -1,7 +1,8 @@
-# Prints all facts of a node that meshctl uses. Sent with `N` (a nonce no output can contain), `EXTRA` (further paths) and
-# `BRIEF` (not empty: only what the proof of a change needs) set before it. Each section is `N begin NAME`, the raw output
-# of a tool, a newline, `N end STATUS`; after a line `N gzip`, all of it is compressed. A missing or failing tool gives an empty section with its status. Nothing here
-# changes the node.
+# Prints all facts of a node that meshctl uses. Sent with `N` (a nonce no output can contain), `EXTRA` (further paths),
+# `BRIEF` (not empty: only what the proof of a change needs) and `NEAR` (not empty: of a long table of originators only
+# the rows that describe neighbors) set before it. Each section is `N begin NAME`, the raw output of a tool, a newline,
+# `N end STATUS`; after a line `N gzip`, all of it is compressed. A missing or failing tool gives an empty section with
+# its status. Nothing here changes the node.
 
 section() { # NAME COMMAND...
 	printf '%s begin %s\n' "$N" "$1"
@@ -171,12 +172,52 @@ transglobal() { # meshif|-m INTERFACE
 }
 
 # batctl prints JSON from 2021.1 on; older ones print tables
+# Each node of a large mesh has several paths to every other one: several kilobytes, even compressed, of a channel that
+# all share. The rows of a neighbor are its own, or all paths through it where none is.
+originators() { # INTERFACE
+	COUNTS=''
+	rows=$(batctl meshif "$1" originators_json) || return
+	if [ -n "$NEAR" ] && [ ${#rows} -gt 8192 ]; then
+		near=$(printf '%s\n' "$rows" | near_originators) && COUNTS=${near%%"["*} && rows=${near#"$COUNTS"}
+	fi
+	printf '%s\n' "$rows"
+}
+
+# near_originators: "SELECTED OTHER [ROWS]", or a failure if the table is not written as expected
+near_originators() {
+	awk '
+		BEGIN { RS = "}" }
+		!/"orig_address"/ { next }
+		{
+			at = index($0, "\"orig_address\":\"")
+			mac = substr($0, at + 16, 17)
+			by = index($0, "\"neigh_address\":\"")
+			if (!at || !by) exit (bad = 1)
+			hop[++count] = substr($0, by + 17, 17)
+			row[count] = substr($0, index($0, "{"))
+			if (mac == hop[count]) own[count] = direct[mac] = 1
+			if (index($0, "\"best\":true")) selected++
+		}
+		END {
+			if (bad || !count) exit 1
+			printf "%d %d [", selected, count - selected
+			for (n = 1; n <= count; n++) {
+				if ((n in own) || !(hop[n] in direct)) {
+					printf "%s%s}", comma, row[n]
+					comma = ","
+				}
+			}
+			print "]"
+		}'
+}
+
 mesh() { # INTERFACE
 	section "batctl.mesh_json $1" batctl meshif "$1" mesh_json
 	section "batctl.hardifs_json $1" batctl meshif "$1" hardifs_json
 	section "batctl.neighbors_json $1" batctl meshif "$1" neighbors_json
-	section "batctl.originators_json $1" batctl meshif "$1" originators_json
+	section "batctl.originators_json $1" originators "$1"
 	if [ $STATUS -eq 0 ]; then
+		[ -z "$COUNTS" ] || section "batctl.originators_count $1" echo "$COUNTS"
 		detail "batctl.statistics $1" batctl meshif "$1" statistics
 		detail "batctl.transglobal $1" transglobal meshif "$1"
 		return
