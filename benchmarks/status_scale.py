@@ -1,7 +1,7 @@
 """Duration of `meshctl status` for a fleet: `python -m benchmarks.status_scale [--radios 50,200] [--robots 20]
 [--against DIR]`.
 
-The devices are those of `status_fleet`: a real SSH server in its own network namespace, with prepared answers. The
+The devices are those of `status_fleet`: real SSH servers in their own network namespace, with prepared answers. The
 command runs in a separate process, over real connections:
 
 - once for the radios alone, and once for radios and robots, with new connections to all;
@@ -30,11 +30,13 @@ from typing import Any
 
 from benchmarks.page import fill, this_machine
 from benchmarks.status_fleet import Devices, process_cpu_s, programs_missing
+from meshctl.device.observe import observation_script
 
 ROOT = Path(__file__).parents[1]
 RESULTS = Path(__file__).with_name("results") / "status_scale.jsonl"
 RUNS = 2
 WATCH_ROUNDS = 4
+ROWS = ("near", "all")
 
 
 def run(command: Sequence[str], environ: Mapping[str, str]) -> tuple[float, float, dict[str, Any]]:
@@ -128,6 +130,10 @@ def measure(radios: int, robots: int, checkouts: Mapping[str, str]) -> list[dict
             again = {label: watched(devices, command, environ) for label, command in commands.items()}
             off = devices.switch_off_half()
             half = repeated(devices, commands, environ, radios + robots - off)
+            answers = {
+                "script": len(observation_script("0" * 40)),
+                **{rows: devices.answer_bytes(rows) for rows in ROWS},
+            }
         finally:
             devices.stop()
     phases = {"alone": alone, "both": both, "again": again, "half": half}
@@ -136,6 +142,7 @@ def measure(radios: int, robots: int, checkouts: Mapping[str, str]) -> list[dict
             "radios": radios,
             "robots": robots,
             "checkout": label,
+            "bytes": answers,
             **{name: values[label] for name, values in phases.items()},
         }
         for label in commands
@@ -164,6 +171,17 @@ def table(results: Sequence[Mapping[str, Any]]) -> str:
                     measured = (f"{took[name]:.2f}" for name in ("seconds", "cpu_s", "devices_cpu_s"))
                     cells = (radios, robots, what, result["checkout"], *measured)
                     lines.append(f"| {' | '.join(map(str, cells))} |")
+    return "\n".join(lines)
+
+
+def sizes(results: Sequence[Mapping[str, Any]]) -> str:
+    """What a look at one radio sends, as Markdown."""
+    lines = [
+        "| radios | the script, bytes | an answer with all originators, compressed | with the rows of neighbors |",
+        "| ---: | ---: | ---: | ---: |",
+    ]
+    sent = {result["radios"]: result["bytes"] for result in results}
+    lines += [f"| {radios} | {size['script']} | {size['all']} | {size['near']} |" for radios, size in sent.items()]
     return "\n".join(lines)
 
 
@@ -208,7 +226,7 @@ def main() -> None:
     rows = [results[key] for key in sorted(results)]
     first = rows[0]
     heading = f"Python {first['python']}, {first['machine']}, {first['cores']} cores for meshctl and all devices"
-    text = f"{heading}\n\n{table(rows)}"
+    text = f"{heading}\n\n{table(rows)}\n\n{sizes(rows)}"
     print(text)
     if arguments.fill:
         fill("status", text)
