@@ -43,7 +43,7 @@ MAX_STEPS_PER_S = 60_000
 """Datagrams, timers and calls of all nodes in a second of virtual time: more is a loop."""
 MAX_IDLE_DATAGRAMS_PER_S, MAX_IDLE_WAKEUPS_PER_S = 15, 40
 MAX_LEGACY_ACKS_PER_S = WINDOW * MAX_BEHIND + WINDOW * (WINDOW + 1) // 2
-"""Each heartbeat of a legacy peer is answered for the fragments expected next, of messages that it gave up too."""
+"""Each heartbeat of a legacy peer is answered for the fragments expected next, also of messages it just gave up."""
 # a message to a peer that only thin links reach may wait there for its whole life
 SETTLE_S, LEAST_BYTES_PER_S = LIFE_S + 5.0, 15_000
 """After the repair everything ends within this time, and what waits at that rate: more than one round of offline, lost

@@ -128,6 +128,20 @@ def test_a_restored_position_is_probed_forward_until_a_fragment_arrives() -> Non
     assert len([answer for answer in old.hear() if isinstance(answer, LegacyAck)]) <= 20
 
 
+def test_a_message_that_its_sender_has_dropped_is_not_acknowledged_for_ever() -> None:
+    acks, number = LegacyAcks(), 20
+    acks.on_fragment(LegacyPayload(number, 1, 9, bytes(1400), wants_ack=True), 0.0)
+    unfinished = {LegacyAck(number, position) for position in (2, 3, 4)}
+    # its sender waits 10 s for the acknowledgment of a fragment
+    assert unfinished < set(acks.heartbeat(9.9))
+    later = acks.heartbeat(40.0)
+    assert not unfinished & set(later)
+    # the next message may have been sent at any time, and lost
+    assert {LegacyAck(number + 1, position) for position in range(3)} < set(later)
+    acks.on_fragment(LegacyPayload(number, 2, 9, bytes(1400), wants_ack=True), 41.0)
+    assert LegacyAck(number, 3) in acks.heartbeat(42.0)
+
+
 def test_extra_acknowledgements_stay_few_without_loss() -> None:
     """One repetition each and some predictions per second: no more airtime than that."""
     acks, now, more = LegacyAcks(), 0.0, 0

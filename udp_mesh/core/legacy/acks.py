@@ -13,6 +13,7 @@ acknowledgments of fragments that are not in flight. So, in addition to the ackn
 4. A run of ours that replaces another one knows what that one had received (`ReceivePosition`), and acknowledges the
    fragments that may have been sent since: with all three slots taken, nothing else would arrive for 10 s.
 
+A message of which nothing has arrived for `STALE_S` is not acknowledged any more, since its sender has dropped it.
 Fragments acknowledged this way stay lost, but nothing behind them is.
 """
 
@@ -43,6 +44,9 @@ MAX_GAP = 16
 MAX_BEHIND = 8
 """Messages before the latest that may still have fragments in flight."""
 
+STALE_S = 30.0
+"""Three times as long as the legacy sender waits for an acknowledgment before it drops its queue."""
+
 MAX_REPEATS = 4096
 """Scheduled repetitions: those of one second at 40 Mbit/s."""
 
@@ -62,15 +66,23 @@ class ReceivePosition(NamedTuple):
     """(message number, next expected position, number of fragments) of the latest messages."""
 
 
+class _Progress(NamedTuple):
+    expected: int
+    """The next position."""
+    total: int
+    arrived_at: float
+    """When the last fragment did; infinite if it did in an earlier run."""
+
+
 class LegacyAcks:
     """`on_fragment` returns what to acknowledge in addition to the fragment; `next_at` is when `due` returns more."""
 
     __slots__ = (
-        "_incomplete",
         "_latest",
         "_lossy_until",
         "_payload_at",
         "_predicted_at",
+        "_recent",
         "_repeats",
         "_restored",
         "_restored_step",
@@ -80,10 +92,10 @@ class LegacyAcks:
         """`position` is that of the previous run, if it is known."""
         self._latest: int | None = None if position is None else position.latest
         """The latest message number."""
-        self._incomplete: OrderedDict[int, tuple[int, int]] = OrderedDict()
-        """Message number -> (next expected position, number of fragments) of the latest messages."""
+        self._recent: OrderedDict[int, _Progress] = OrderedDict()
+        """Message number -> what has arrived of the latest messages."""
         for sequence, expected, total in () if position is None else position.recent:
-            self._incomplete[sequence] = (expected, total)
+            self._recent[sequence] = _Progress(expected, total, float("inf"))
         self._restored = position is not None
         """Nothing has arrived in this run yet."""
         self._restored_step = RESTORED_STEPS
@@ -100,7 +112,7 @@ class LegacyAcks:
         self._payload_at = now
         self._repeat(LegacyAck(fragment.sequence, fragment.position), now)
         more: list[LegacyAck] = []
-        expected, total = self._incomplete.get(fragment.sequence, (0, fragment.total))
+        expected, total, _ = self._recent.get(fragment.sequence, (0, fragment.total, now))
         if total != fragment.total:
             # Its numbers have restarted.
             expected = 0
@@ -108,10 +120,10 @@ class LegacyAcks:
             self._lossy_until = now + LOSSY_FOR_S
             first = max(expected, fragment.position - MAX_GAP)
             more += [LegacyAck(fragment.sequence, position) for position in range(first, fragment.position)]
-        self._incomplete[fragment.sequence] = (max(expected, fragment.position + 1), fragment.total)
-        self._incomplete.move_to_end(fragment.sequence)
-        while len(self._incomplete) > MAX_BEHIND:
-            self._incomplete.popitem(last=False)
+        self._recent[fragment.sequence] = _Progress(max(expected, fragment.position + 1), fragment.total, now)
+        self._recent.move_to_end(fragment.sequence)
+        while len(self._recent) > MAX_BEHIND:
+            self._recent.popitem(last=False)
         for ack in more:
             self._repeat(ack, now)
         for sequence in self._skipped(fragment.sequence):
@@ -120,24 +132,22 @@ class LegacyAcks:
                 self._repeat(ack, now)
         return more
 
-    def heartbeat(self) -> list[LegacyAck]:
+    def heartbeat(self, now: float) -> list[LegacyAck]:
         """The peer sent a heartbeat: release what may be stuck."""
         if not self._restored:
-            return self._predicted()
+            return self._predicted(now)
         self._restored_step = 0
         self._predicted_at = float("-inf")
         # Less urgent messages have lower numbers than the latest one: look behind each that was seen.
-        following = {
-            _sequence_behind(sequence, -ahead) for sequence in self._incomplete for ahead in range(1, WINDOW + 1)
-        }
-        return [ack for sequence in following - self._incomplete.keys() for ack in _first(sequence)]
+        following = {_sequence_behind(sequence, -ahead) for sequence in self._recent for ahead in range(1, WINDOW + 1)}
+        return [ack for sequence in following - self._recent.keys() for ack in _first(sequence)]
 
     def position(self) -> ReceivePosition | None:
         """The position for the next run of this node (None: nothing was received)."""
         if self._latest is None:
             return None
         return ReceivePosition(
-            self._latest, tuple([(sequence, *progress) for sequence, progress in self._incomplete.items()])
+            self._latest, tuple([(sequence, seen.expected, seen.total) for sequence, seen in self._recent.items()])
         )
 
     def _skipped(self, sequence: int) -> list[int]:
@@ -150,7 +160,7 @@ class LegacyAcks:
         self._latest = sequence
         # If either side has just started, anything before may be in flight.
         numbers = [_sequence_behind(sequence, behind) for behind in range(1, min(ahead - 1, MAX_BEHIND) + 1)]
-        return [number for number in numbers if number not in self._incomplete]
+        return [number for number in numbers if number not in self._recent]
 
     def due(self, now: float) -> list[LegacyAck]:
         """Repeated and predicted acknowledgments due now."""
@@ -165,10 +175,10 @@ class LegacyAcks:
         if now >= predict_at and self._predicts(predict_at):
             self._predicted_at = now
             if self._restored:
-                acks += self._predicted(self._restored_step * RESTORED_STEP, RESTORED_STEP)
+                acks += self._predicted(now, self._restored_step * RESTORED_STEP, RESTORED_STEP)
                 self._restored_step += 1
             else:
-                acks += self._predicted()
+                acks += self._predicted(now)
         return acks
 
     def _predicts(self, at: float) -> bool:
@@ -180,13 +190,15 @@ class LegacyAcks:
         predict_at = self._predicted_at + PREDICT_INTERVAL_S
         return min(at, predict_at) if self._predicts(predict_at) else at
 
-    def _predicted(self, skip: int = 0, reach: int = WINDOW) -> list[LegacyAck]:
+    def _predicted(self, now: float, skip: int = 0, reach: int = WINDOW) -> list[LegacyAck]:
         """The fragments expected next, of each incomplete message and of those after the latest: `reach` of each, after
         the first `skip`."""
         if self._latest is None:
             return []
         acks: list[LegacyAck] = []
-        for sequence, (expected, total) in self._incomplete.items():
+        for sequence, (expected, total, arrived_at) in self._recent.items():
+            if now - arrived_at > STALE_S:
+                continue
             first = expected + skip
             acks += [LegacyAck(sequence, position) for position in range(first, min(total, first + reach))]
         for ahead in range(1, reach + 1):

@@ -170,7 +170,7 @@ class LegacyPeers:
             legacy.received_bytes += len(data) + IP_UDP_BYTES
             match datagram:
                 case Host():
-                    self._acknowledge(legacy, legacy.acks.heartbeat())
+                    self._acknowledge(legacy, legacy.acks.heartbeat(now))
                 case LegacyAck(sequence, position):
                     legacy.sender.acknowledge(sequence, position, now)
                     report_ended(self._state, legacy.peer, now)
