@@ -8,6 +8,7 @@ starts no shell and parses nothing. The shell ends with its standard input, that
 
 from __future__ import annotations
 
+import re
 import secrets
 from collections.abc import Sequence
 
@@ -19,6 +20,8 @@ from meshctl.device.framing import framed, quoted
 from meshctl.device.ssh_channel import MAX_OUTPUT_BYTES
 
 _READ_BYTES = 32 << 10
+_END = re.compile(rb"(ended-[0-9a-f]{32}) (\d{1,3})\n\Z")
+_END_BYTES = len("ended-") + 32 + len(" 255\n")
 # Its standard error is not read, and would fill the channel.
 _LOOP = """\
 run() (
@@ -59,15 +62,14 @@ class KeptScript:
             raise ValueError("a line break in an argument")
         self._channel.sendall(line.encode())
         output = bytearray()
-        end = f"{mark} ".encode()
-        while not output.endswith(b"\n") or (at := output.rfind(end, -len(end) - 4)) < 0:
+        while (ended := _END.search(output, max(0, len(output) - _END_BYTES))) is None or ended[1] != mark.encode():
             data = self._channel.recv(_READ_BYTES)
             if not data:
                 raise EOFError("the node's shell ended")
             output += data
             if len(output) > MAX_OUTPUT_BYTES:
                 raise OutputTooLarge(f"{self._label}: the command printed more than {MAX_OUTPUT_BYTES >> 20} MiB")
-        return Completed(bytes(output[:at]), b"", int(output[at + len(end) :]))
+        return Completed(bytes(output[: ended.start()]), b"", int(ended[2]))
 
     def close(self) -> None:
         self._channel.close()
