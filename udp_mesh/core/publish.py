@@ -30,7 +30,8 @@ from udp_mesh.core.sender.pending import Outcome
 from udp_mesh.core.sender.pmtu import ETHERNET_MTU
 from udp_mesh.core.sender.rate_limit import TokenBucket
 from udp_mesh.core.sender.send_quota import pack_until
-from udp_mesh.core.settings import Outbox, Topic, is_type_name
+from udp_mesh.core.setting_checks import is_type_name
+from udp_mesh.core.settings import Outbox, Topic
 from udp_mesh.core.state import State
 from udp_mesh.core.subscriptions.messages import is_about_subscriptions
 from udp_mesh.core.thin.numbering import numbered, unnumbered

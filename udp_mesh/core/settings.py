@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import Literal
 
+from udp_mesh.core.setting_checks import check_items, check_name, check_type, written
 from udp_mesh.core.thin.settings import ThinSettings, check_thin
 from udp_mesh.crypto import Key
 from udp_mesh.wire.limits import (
@@ -15,7 +16,6 @@ from udp_mesh.wire.limits import (
     MAX_NAME_BYTES,
     MAX_RELAY_HOPS,
     MAX_TOPIC_BYTES,
-    MAX_TYPE_BYTES,
     PRIORITY_LEVELS,
 )
 
@@ -27,32 +27,6 @@ RELAY_LINK = "~relay"
 
 DEFAULT_PORT = 8700
 """UDP port of the legacy system, kept so that one firewall rule serves both."""
-
-
-def is_name(name: str, limit_bytes: int) -> bool:
-    """Whether the wire format accepts this as the name of a node or a topic."""
-    # Surrogates are not printable, so a printable string can be encoded.
-    return name.isprintable() and not any(map(str.isspace, name)) and 1 <= len(name.encode()) <= limit_bytes
-
-
-def is_type_name(name: str) -> bool:
-    """Whether the wire format accepts this as the name of a topic's type, which may be empty."""
-    return name.isprintable() and len(name.encode()) <= MAX_TYPE_BYTES
-
-
-def _check_name(name: str, what: str, limit_bytes: int) -> None:
-    """Raises ValueError unless `is_name` holds."""
-    if not 0 < len(name.encode()) <= limit_bytes:
-        raise ValueError(f"{what} {name!r}: expected 1 to {limit_bytes} bytes")
-    if not is_name(name, limit_bytes):
-        raise ValueError(f"{what} {name!r}: expected no white space and no control characters")
-
-
-def _written(value: object) -> object:
-    """A value as it is written in a configuration."""
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    return value.value if isinstance(value, Enum) else value
 
 
 class Outbox(Enum):
@@ -114,6 +88,7 @@ class Log:
     copies: int = 3
 
     def __post_init__(self) -> None:
+        check_items(self.readers, str, "log.readers")
         for name in ("max_items", "max_bytes"):
             if getattr(self, name) < 1:
                 raise ValueError(f"log.{name}: expected at least 1, found {getattr(self, name)}")
@@ -161,7 +136,11 @@ class Topic:
         return self.outbox_on_disk and self.outbox is not Outbox.NONE
 
     def __post_init__(self) -> None:
-        _check_name(self.name, "topic", MAX_TOPIC_BYTES)
+        check_name(self.name, "topic", MAX_TOPIC_BYTES)
+        check_type(self.priority, int, f"topic {self.name}: priority")
+        check_type(self.outbox, Outbox, f"topic {self.name}: outbox")
+        check_items(self.destinations, str, f"topic {self.name}: destinations")
+        check_items(self.links, str, f"topic {self.name}: links")
         if not 0 <= self.priority < PRIORITY_LEVELS:
             raise ValueError(f"topic {self.name}: expected a priority of 0 to 15, found {self.priority}")
         if self.keep_last is not None and self.keep_last < 1:
@@ -197,7 +176,7 @@ class Topic:
         ):
             if getattr(self, name) != unset:
                 raise ValueError(
-                    f"topic {self.name}: expected no {name} for a log, found {_written(getattr(self, name))}"
+                    f"topic {self.name}: expected no {name} for a log, found {written(getattr(self, name))}"
                 )
 
 
@@ -239,8 +218,10 @@ class RelaySettings:
         return self.hops > 1 and (self.all or bool(self.names))
 
     def __post_init__(self) -> None:
+        check_items(self.names, str, "relay")
+        check_items(self.keys, Key, "relay keys")
         for name in self.names:
-            _check_name(name, "relay", MAX_NAME_BYTES)
+            check_name(name, "relay", MAX_NAME_BYTES)
         if not 1 <= self.hops <= MAX_RELAY_HOPS:
             raise ValueError(f"relay_hops: expected 1 to {MAX_RELAY_HOPS}, found {self.hops}")
         if (self.all or self.names) and self.hops == 1:
@@ -381,9 +362,15 @@ class Settings:
     limits: Limits = field(default_factory=Limits)
 
     def __post_init__(self) -> None:
-        _check_name(self.name, "name", MAX_NAME_BYTES)
+        check_name(self.name, "name", MAX_NAME_BYTES)
         if "/" in self.name:
             raise ValueError(f"name {self.name!r}: expected no slash (names are parts of topic names)")
+        check_type(self.port, int, "port")
+        if not 0 < self.port <= 65535:
+            raise ValueError(f"port: expected 1 to 65535, found {self.port}")
+        check_items(self.keys, Key, "keys")
+        check_items(self.topics, Topic, "topics")
+        check_items(self.neighbours, Neighbour, "neighbours")
         if not self.keys and not self.unkeyed:
             raise ValueError("keys: expected a fleet key or an explicit unkeyed=True, found neither")
         if self.keys and self.unkeyed:

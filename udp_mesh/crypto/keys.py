@@ -47,7 +47,10 @@ class Key:
 
     @classmethod
     def parse(cls, text: str) -> Key:
-        """Parse a key of 64 hexadecimal digits or 44 characters of base64. Raises ValueError (without the text)."""
+        """Parse a key of 64 hexadecimal digits or 44 characters of base64. Raises ValueError (without the text), and
+        TypeError for what is no text, such as the None of a variable that is not set."""
+        if not isinstance(text, str):
+            raise TypeError(f"key: expected text, found {type(text).__name__}")
         compact = text.strip()
         try:
             if len(compact) == 2 * SECRET_BYTES:

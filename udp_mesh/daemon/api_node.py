@@ -31,6 +31,7 @@ from udp_mesh.core.events import (
     Rejected,
     RejectReason,
 )
+from udp_mesh.core.setting_checks import check_items, check_type
 from udp_mesh.core.settings import Settings
 from udp_mesh.daemon.driver import Driver
 from udp_mesh.daemon.interface import POSITION_TOPIC
@@ -63,6 +64,7 @@ class Node:
         store: DirectoryStore | None = None,
         urgent_dscp: int = 46,
     ) -> None:
+        check_items(links, LinkConfig, "links")
         self._settings = replace(settings, confirms=True)
         self._links = tuple(links)
         self._store = store
@@ -75,7 +77,10 @@ class Node:
         self._outcomes: dict[tuple[MessageId, str], asyncio.Future[Outcome]] = {}
 
     async def __aenter__(self) -> Node:
-        """Opens the links. Raises OSError if the kernel cannot list its interfaces."""
+        """Opens the links. Raises OSError if the kernel cannot list its interfaces, and RuntimeError in a node that is
+        running already."""
+        if self._driver is not None and not self._driver.closed:
+            raise RuntimeError("the node is running already: use another `Node` for a second one")
         self._driver = Driver(
             self._settings,
             self._links,
@@ -107,8 +112,9 @@ class Node:
         return self._driver
 
     async def send(self, topic: str, payload: bytes, *, to: str | None = None, type_name: str = "") -> MessageId:
-        """Accepts a message for one peer, for the topic's destinations, or for all. Raises SendRefusedError."""
-        outcome = self.driver.send(topic, payload, destination=to, type_name=type_name)
+        """Accepts a message for one peer, for the topic's destinations, or for all. Raises SendRefusedError, and
+        TypeError for a payload that is not bytes. A buffer that may change, such as a bytearray, is copied."""
+        outcome = self._accept(topic, payload, to, type_name)
         if isinstance(outcome, Rejected):
             raise SendRefusedError(outcome)
         if self.driver.sends_now:
@@ -122,7 +128,7 @@ class Node:
         found = self.driver.node.topic(topic)
         if found is not None and not found.reliable:
             raise ValueError(f"topic {topic} is best effort and reports no outcomes: use `send`, or make it reliable")
-        outcome = self.driver.send(topic, payload, destination=to, type_name=type_name)
+        outcome = self._accept(topic, payload, to, type_name)
         if isinstance(outcome, Rejected):
             raise SendRefusedError(outcome)
         future: asyncio.Future[Outcome] = asyncio.get_running_loop().create_future()
@@ -131,6 +137,13 @@ class Node:
             return await future
         finally:
             del self._outcomes[outcome, to]
+
+    def _accept(self, topic: str, payload: bytes, to: str | None, type_name: str) -> MessageId | Rejected:
+        check_type(topic, str, "topic")
+        if to is not None:
+            check_type(to, str, "to")
+        check_type(type_name, str, "type_name")
+        return self.driver.send(topic, _unchanging(payload), destination=to, type_name=type_name)
 
     async def messages(self) -> AsyncIterator[MessageReceived]:
         """Messages in order of completion, until the node is closed. A message counts as delivered once it is
@@ -180,3 +193,15 @@ class Node:
                 future.set_result(event)
         self._events.append(event)
         self._happened.set()
+
+
+def _unchanging(payload: object) -> bytes:
+    """The payload as bytes, which no program can change while it waits. Raises TypeError for anything else."""
+    if isinstance(payload, bytes):
+        return payload
+    if isinstance(payload, str):
+        raise TypeError("payload: expected bytes, found str; encode it first, for example with .encode()")
+    try:
+        return bytes(memoryview(payload))  # type: ignore[arg-type]
+    except TypeError:
+        raise TypeError(f"payload: expected bytes, found {type(payload).__name__}") from None

@@ -15,7 +15,8 @@ from typing import TypeVar
 
 from udp_mesh import __version__
 from udp_mesh.client.mesh_client import Header
-from udp_mesh.core.settings import Settings, is_type_name
+from udp_mesh.core.setting_checks import is_type_name
+from udp_mesh.core.settings import Settings
 from udp_mesh.daemon import metrics
 from udp_mesh.daemon.api import Client, RequestError
 from udp_mesh.daemon.configuration import load, read_keys, read_rates

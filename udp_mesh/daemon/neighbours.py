@@ -5,7 +5,8 @@ from __future__ import annotations
 import ipaddress
 import re
 
-from udp_mesh.core.settings import Address, Neighbour, is_name
+from udp_mesh.core.setting_checks import is_name
+from udp_mesh.core.settings import Address, Neighbour
 from udp_mesh.daemon.toml_source import Table
 from udp_mesh.links.attachments import LinkConfig
 from udp_mesh.wire.limits import MAX_NAME_BYTES, MAX_TOPIC_BYTES

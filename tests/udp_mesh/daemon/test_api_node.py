@@ -132,3 +132,53 @@ def test_a_node_used_outside_its_context_raises_runtime_error() -> None:
     node = make("alice", 1, 2, 9)
     with pytest.raises(RuntimeError, match="async with"):
         node.conditions()
+
+
+@pytest.mark.parametrize("payload", ["ready", None, 7, [1, 2]])
+def test_a_payload_that_is_not_bytes_is_refused_when_it_is_sent(payload: Any) -> None:
+    async def body(alice: Node, bob: Node) -> None:
+        with pytest.raises(TypeError, match="payload: expected bytes, found "):
+            await alice.send("status", payload, to="bob")
+        with pytest.raises(TypeError, match="payload: expected bytes, found "):
+            await alice.deliver("status", payload, to="bob")
+        assert alice.conditions().counters.messages_sent == 0
+
+    run(body)
+
+
+def test_a_message_is_what_its_buffer_contained_when_it_was_sent() -> None:
+    async def body(alice: Node, bob: Node) -> None:
+        buffer = bytearray(b"first" * 1_000)
+        view: Any = memoryview(buffer)
+        waiting = asyncio.ensure_future(alice.deliver("map", view, to="bob"))
+        await asyncio.sleep(0)
+        buffer[:] = b"later" * 1_000
+        assert isinstance(await waiting, MessageDelivered)
+        assert (await anext(bob.messages())).payload == b"first" * 1_000
+
+    run(body)
+
+
+def test_a_topic_destination_or_type_that_is_no_text_is_named() -> None:
+    async def body(alice: Node, bob: Node) -> None:
+        wrong: Any = ["bob"]
+        for arguments in ({"to": wrong}, {"to": "bob", "type_name": wrong}, {"topic": wrong}):
+            with pytest.raises(TypeError, match=r"(to|type_name|topic): expected str, found list"):
+                await alice.send(**{"topic": "map", "payload": b"", **arguments})
+
+    run(body)
+
+
+def test_a_running_node_cannot_be_entered_again() -> None:
+    async def body(alice: Node, bob: Node) -> None:
+        with pytest.raises(RuntimeError, match="running already"):
+            await alice.__aenter__()
+        assert isinstance(await alice.deliver("map", b"still here", to="bob"), MessageDelivered)
+
+    run(body)
+
+
+def test_a_single_link_in_place_of_a_sequence_is_named() -> None:
+    link: Any = LinkConfig(address="127.0.4.1")
+    with pytest.raises(TypeError, match="links: expected a tuple of LinkConfig, found LinkConfig"):
+        Node(Settings("alice", unkeyed=True), links=link)
