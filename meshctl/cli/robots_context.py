@@ -273,14 +273,22 @@ def finish(context: RobotsContext, journaled: JournaledRun, retry: str = "run `m
     return print_totals(context.opened, journaled, as_json=context.as_json, unfinished="robots", retry=retry)
 
 
-def run_command(context: RobotsContext, command: str, **parameters: Any) -> JournaledRun:
-    """Run a command on all robots of the context; `parameters` are journaled with it."""
+def run_command(
+    context: RobotsContext, command: str, begun: Callable[[], None] = lambda: None, **parameters: Any
+) -> JournaledRun:
+    """Run a command on all robots of the context; `parameters` are journaled with it. `begun` is called once the run is
+    in the journal, before the first robot."""
     parameters = {
         **parameters,
         "wait_s": context.options.wait_s,
         "wheels": str(context.wheels.resolve()) if context.wheels else "",
     }
-    journaled = context.run_journaled(command, lambda opened: _task_for(command, opened, parameters), parameters)
+
+    def task(opened: RobotsContext) -> RobotTask:
+        begun()
+        return _task_for(command, opened, parameters)
+
+    journaled = context.run_journaled(command, task, parameters)
     _write_collector_keys(context, journaled.outcomes)
     return journaled
 

@@ -9,12 +9,13 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from functools import partial
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 import yaml
 
 from meshctl.cli.context import DryRun
+from meshctl.cli.journaled_run import JournaledRun
 from meshctl.cli.output import echo
 from meshctl.cli.robots_context import RobotsContext, finish, run_command, with_robots_context
 from meshctl.cli.robots_dry_run import deploy_differences, exit_for_dry_run
@@ -41,7 +42,7 @@ _SHARED = ("inventory", "wheels", "wait_s", "ask_sudo", "as_json", "key")
 def topic_add(context: RobotsContext, topic: Topic, values: Assignments, dry_run: DryRun = False) -> None:
     """Add a topic to the inventory and to every running daemon, without a restart.
 
-    Example: meshctl robots topic add video priority=9 reliable=false destinations=[base-station]
+    Example: meshctl robots topic add video priority=9 reliable=false 'destinations=[base-station]'
     """
     fields = _fields(values)
     _change_topics(context, topic, lambda editor: add_topic(editor, topic, fields), dry_run=dry_run)
@@ -96,8 +97,7 @@ def _change_topics(context: RobotsContext, topic: str, edit: Callable[[Editor], 
             echo(change.diff(), nl=False)
     if dry_run:
         raise exit_for_dry_run(changed, deploy_differences(changed))
-    save(changes)
-    journaled = run_command(changed, "topic", topic=topic)
+    journaled = _save_and_run(changed, changes, "topic", topic=topic)
     if not any(outcome.result.is_good for outcome in journaled.outcomes.values()):
         _undo(changes)
         echo("no robot accepted the change; the inventory edit was reverted", err=True)
@@ -112,6 +112,21 @@ def _edited(context: RobotsContext, edit: Callable[[Editor], None]) -> tuple[Rob
     editor = Editor.open(context.inventory, environ=os.environ)
     edit(editor)
     return context.with_fleet(editor.fleet(), only_configuration=True), editor.changes()
+
+
+def _save_and_run(
+    context: RobotsContext, changes: tuple[FileEdit, ...], command: str, **parameters: Any
+) -> JournaledRun:
+    """Save the edits, and run the command. If it is refused before its first robot, the edits are reverted."""
+    begun: list[bool] = []
+    save(changes)
+    try:
+        return run_command(context, command, lambda: begun.append(True), **parameters)
+    except BaseException:
+        if not begun:
+            _undo(changes)
+            echo("no robot was reached; the inventory edit was reverted", err=True)
+        raise
 
 
 def _undo(changes: tuple[FileEdit, ...]) -> None:
@@ -144,8 +159,7 @@ def rotate_key_command(
         if not context.as_json:
             echo(f"step {number} of {len(todo)}: {stage.title}")
         context, changes = _edited(context, partial(_set_keys, keys=stage.keys))
-        save(changes)
-        journaled = run_command(context, "rotate-key", new_key=new_key)
+        journaled = _save_and_run(context, changes, "rotate-key", new_key=new_key)
         late = ", ".join(name for name, outcome in journaled.outcomes.items() if not outcome.result.is_good)
         if late:
             echo(f"stopped before the next step: {late} did not complete this one; no robot is cut off", err=True)
