@@ -19,15 +19,22 @@ def write_starter(directory: Path, ssh_key: str = "") -> tuple[Path, ...]:
     taken = [name for name in names if (directory / name).exists() or (directory / name).is_symlink()]
     if taken:
         raise InputError(f"{directory / taken[0]} already exists; not overwritten", hint="choose another directory")
+    created: list[Path] = []
     try:
         directory.mkdir(parents=True, exist_ok=True)
         for name in names:
             with (directory / name).open("xb") as stream:
+                created.append(directory / name)
                 stream.write((source / name).read_bytes())
-    except OSError as reason:
-        raise InputError(f"{reason.filename or directory} cannot be written: {reason.strerror}") from reason
-    if ssh_key:
-        editor = Editor.open(directory)
-        editor.set(("operators", "ssh_keys"), [ssh_key])
-        save(editor.changes())
-    return tuple(directory / name for name in names)
+        if ssh_key:
+            editor = Editor.open(directory)
+            editor.set(("operators", "ssh_keys"), [ssh_key])
+            save(editor.changes())
+    except BaseException as reason:
+        # a part of a file would be an inventory with errors, which the next `init` does not overwrite
+        for path in created:
+            path.unlink(missing_ok=True)
+        if isinstance(reason, OSError):
+            raise InputError(f"{reason.filename or directory} cannot be written: {reason.strerror}") from reason
+        raise
+    return tuple(created)

@@ -113,7 +113,13 @@ def keygen(arguments: argparse.Namespace) -> int:
     except OSError as error:
         print_error(f"{path}: {error.strerror}")
         return Exit.FAILED
-    with os.fdopen(descriptor, "w") as file:
-        file.write(line)
+    try:
+        with os.fdopen(descriptor, "w") as file:
+            file.write(line)
+    except OSError as error:
+        # an empty file would be refused by every daemon, and by the next keygen
+        path.unlink(missing_ok=True)
+        print_error(f"{path}: {error.strerror}")
+        return Exit.FAILED
     print_text(f"{path}: key {key.key_id.hex()}")
     return Exit.OK

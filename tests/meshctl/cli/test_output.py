@@ -17,6 +17,7 @@ import typer
 from meshctl.cli.main import _guarded
 from meshctl.cli.output import echo, echo_error, write_file
 from meshctl.errors import InputError
+from meshctl.inventory.starter import write_starter
 
 
 @pytest.fixture
@@ -26,6 +27,17 @@ def _full_disk() -> Iterator[None]:
     resource.setrlimit(resource.RLIMIT_FSIZE, (4096, limits[1]))
     yield
     resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+
+@pytest.mark.usefixtures("_full_disk")
+@pytest.mark.parametrize(
+    "key", ["", "ssh-ed25519 AAAAC3NzaC1lZDI1NTE5AAAAIFCutyt+xTdKa5I6TRfbIza4ho4hbhlYM4e+/swgNX9L me"]
+)
+def test_a_full_disk_leaves_no_part_of_a_starter_inventory(tmp_path: Path, key: str) -> None:
+    """The part was an inventory with errors, and the next `init` refused to overwrite it."""
+    with pytest.raises(InputError, match="cannot be written: File too large"):
+        write_starter(tmp_path / "fleet", key)
+    assert not list((tmp_path / "fleet").iterdir())
 
 
 @pytest.mark.usefixtures("_full_disk")
