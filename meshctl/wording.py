@@ -45,3 +45,8 @@ def all_of(names: Sequence[str]) -> str:
 def one_of(names: Sequence[str]) -> str:
     """The alternatives after `expected`; the name alone if there is no other."""
     return names[0] if len(names) == 1 else f"one of {join_limited(names)}"
+
+
+def two_digits(value: float) -> str:
+    """A positive number with two significant digits, or as a whole number: `0.75`, `7.5`, `120`, never `1.2e+02`."""
+    return f"{value:.0f}" if value >= 10 else f"{value:.2g}"

@@ -9,7 +9,7 @@ import pytest
 
 from meshctl.plan.values import FileChange
 from meshctl.report.changed_options import settings
-from meshctl.wording import counted, join_limited, lock_owners
+from meshctl.wording import counted, join_limited, lock_owners, two_digits
 
 _ROOT = Path(__file__).resolve().parents[2]
 # `{count} node{'s' if count != 1 else ''}`
@@ -46,3 +46,10 @@ def test_counts_are_worded_in_one_place(package: str) -> None:
     assert files
     found = [str(path) for path in files if _BY_HAND.search(path.read_text(encoding="utf-8"))]
     assert found == []
+
+
+@pytest.mark.parametrize(
+    ("number", "text"), [(0.0751, "0.075"), (1, "1"), (7.46, "7.5"), (9.99, "10"), (15.2, "15"), (100.4, "100")]
+)
+def test_a_rounded_number_has_no_exponent(number: float, text: str) -> None:
+    assert two_digits(number) == text

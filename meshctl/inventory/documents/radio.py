@@ -157,7 +157,7 @@ class MeshDocument(Document):
     """MTU of the radio's interface: batman-adv needs 1532 for a full Ethernet frame, and logs a warning below 1560."""
     lan_mtu: Whole = Field(default=1500, ge=68, le=9000)
     """MTU of the LAN behind the nodes."""
-    reconnect_s: Real = Field(default=5.0, gt=0, le=60)
+    reconnect_s: Real = Field(default=5.0, gt=0, le=300)
     """Target time in seconds to heal after a link fails; selects batman-adv's intervals."""
     min_beacons: Whole = Field(default=0, ge=0, le=100_000)
     """Minimum number of beacons, checked by lint."""

@@ -19,7 +19,7 @@ from meshctl.resolve import (
     heal_s,
     originator_airtime,
 )
-from meshctl.wording import counted, join_limited
+from meshctl.wording import counted, join_limited, two_digits
 
 # airtime shares from which MC516, MC502 and MC501 report
 _AIRTIME_NOTE = 0.03
@@ -164,7 +164,10 @@ def interval_misses_target(fleet: Fleet, _context: LintContext) -> Iterator[Find
             path = ("meshes", mesh.name, "batman", "orig_interval_ms")
             expected = f"healing within {mesh.reconnect_s:g} s"
             yield Finding(
-                path, "slower than reconnect_s", expected, f"{written} ms, which heals in {heal_s(written):.2g} s"
+                path,
+                "slower than reconnect_s",
+                expected,
+                f"{written} ms, which heals in {two_digits(heal_s(written))} s",
             )
 
 

@@ -13,7 +13,7 @@ from meshctl.lint.rules.references import suggest
 from meshctl.model import Fleet, ThinBand, ThinLink, Topic
 from meshctl.model.thin import BURST_SHARE, MAX_2400_MHZ_FRAME_BYTES, PART_OVERHEAD_BYTES
 from meshctl.render.thin import frame_problems
-from meshctl.wording import join_limited
+from meshctl.wording import join_limited, two_digits
 
 
 def _countries(text: str) -> frozenset[str]:
@@ -166,7 +166,8 @@ def thin_overload(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
         if share > allowed:
             text = f"{', '.join(topic.name for topic in topics)} and presence"
             path = ("udp_mesh", "thin_links", name)
-            yield Finding(path, text, f"at most {100 * allowed:.2g} % of the time per robot", f"{100 * share:.2g} %")
+            expected = f"at most {two_digits(100 * allowed)} % of the time per robot"
+            yield Finding(path, text, expected, f"{two_digits(100 * share)} %")
 
 
 def _carries(name: str, topic: Topic) -> bool:

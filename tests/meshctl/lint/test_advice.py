@@ -22,18 +22,26 @@ def _codes(example: Example | str, directory: Path) -> list[str]:
     return [item.code for item in _found(example, directory)]
 
 
-def test_a_mesh_at_the_longest_interval_gets_advice_that_helps(tmp_path: Path) -> None:
-    nodes = 'nodes: {"c[01-40]": {state: carried, address: {from: 10.42.0.121}}}'
-    robots = 'robots: {husky1: {carries: ["c[01-40]", b01]}}'
+@pytest.mark.parametrize("last", ["40", "99"])
+def test_a_mesh_at_the_longest_interval_gets_advice_that_helps(last: str, tmp_path: Path) -> None:
+    """With 99 beacons, it named a `reconnect_s` that the inventory refused."""
+    nodes = f'nodes: {{"c[01-{last}]": {{state: carried, address: {{from: 10.42.0.121}}}}}}'
+    robots = f'robots: {{husky1: {{carries: ["c[01-{last}]", b01]}}}}'
 
     def fragment(mesh: str) -> str:
         return f"{{meshes: {{main: {{{mesh}}}}}, {nodes}, {robots}}}"
 
     found = _found(fragment("reconnect_s: 20"), tmp_path)
-    hint = next(item.hint for item in found if item.code == "MC502")
+    hint = next(item.hint for item in found if item.code in {"MC501", "MC502"})
     interval, target = re.findall(r"`(?:batman: {(orig_interval_ms: \d+)}|(reconnect_s: [\d.]+))`", hint)
-    followed = _codes(fragment(f"{target[1]}, batman: {{{interval[0]}}}"), tmp_path)
-    assert not {"MC502", "MC504"} & set(followed)
+    followed = set(_codes(fragment(f"{target[1]}, batman: {{{interval[0]}}}"), tmp_path))
+    assert not {"MC501", "MC502", "MC504", "INV021"} & followed
+
+
+def test_the_time_to_heal_of_a_long_interval_is_a_number_of_seconds(tmp_path: Path) -> None:
+    found = _found("meshes: {main: {reconnect_s: 60, batman: {orig_interval_ms: 20000}}}", tmp_path)
+    (finding,) = (item for item in found if item.code == "MC504")
+    assert "found 20000 ms, which heals in 100 s" in str(finding)
 
 
 @pytest.mark.parametrize(
