@@ -217,7 +217,8 @@ class _Composer:
         assert key is not None
         first = mapping.keys.get(key.text)
         if key.is_plain and key.text == "<<":
-            hint = "share values between nodes with `groups` and `defaults`"
+            mapping.is_partial = True
+            hint = "write the values here; nodes share values with `groups` and `defaults`"
             self._note(codes.error(codes.YAML_FEATURE, position(key), "merge keys are not supported", hint=hint))
         elif first is not None:
             self._note(

@@ -34,6 +34,8 @@ _VARIABLE = re.compile(r"[A-Z_][A-Z0-9_]*")
 _SUSPICIOUS_COMMENT = re.compile(rf"({_SECRET_WORDS.pattern})\s*[:=]|[A-Za-z0-9+/_=-]{{20,}}", re.IGNORECASE)
 _WORD = re.compile(r"[^\s\[\]{},:#\"'&*|>-]+")
 _MAX_KEY_CHARACTERS = 40
+# a key where YAML allows one: at the start of a line or an item, or in a flow mapping
+_KEY = re.compile(r"(?:^[ -]*|[{,][ ]*)(<<|[A-Za-z_]+)(?=[ ]*:(?:\s|$))", re.MULTILINE)
 # an anchor or alias where YAML allows one: after a space or an indicator
 _ANCHOR = re.compile(r"(?:^|(?<=[\s\[{,]))([&*])([^\s\[\]{},]+)", re.MULTILINE)
 
@@ -82,10 +84,17 @@ class Excerpts:
             for start, end, mark in sorted(_spans(root, InventoryDocument), key=lambda span: span[2]):
                 self._marks[start:end] = bytes([mark]) * (min(end, len(self._marks)) - start)
             self._show_anchors(self._marks)
+            self._show_refused_keys(self._marks)
         else:
             for found in re.finditer(r"([A-Za-z_]+)[\"']?\s*:(?=\s|$)", self.text):
                 if found[1] in _all_keys():
                     self._marks[found.start(1) : found.end(1)] = bytes([_Visibility.SHOWN]) * len(found[1])
+
+    def _show_refused_keys(self, marks: bytearray) -> None:
+        """Show keys that are no part of the tree: of merges, and known ones that are written twice."""
+        for found in _KEY.finditer(self.text):
+            if (found[1] == "<<" or found[1] in _all_keys()) and not any(marks[found.start(1) : found.end(1)]):
+                marks[found.start(1) : found.end(1)] = bytes([_Visibility.SHOWN]) * len(found[1])
 
     def _show_anchors(self, marks: bytearray) -> None:
         """Show the names that are both defined and used. Another `&word` may be a secret that was not quoted."""

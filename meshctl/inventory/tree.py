@@ -56,7 +56,8 @@ class SequenceNode:
 
 @dataclass(slots=True)
 class MappingNode:
-    """`keys` and `values` have the same keys in the same order. `end` is exact for flow style only."""
+    """`keys` and `values` have the same keys in the same order. `end` is exact for flow style only.
+    `is_partial`: a merge key was refused, whose keys are missing here."""
 
     file: str
     line: int
@@ -67,6 +68,7 @@ class MappingNode:
     keys: dict[str, Scalar] = field(default_factory=dict)
     values: dict[str, Tree] = field(default_factory=dict)
     weight: int = 1
+    is_partial: bool = False
 
 
 Tree = Scalar | SequenceNode | MappingNode

@@ -82,20 +82,33 @@ def validate(root: MappingNode) -> Validated:
         return Validated(InventoryDocument.model_validate(plain_data(root)), ())
     except ValidationError as reason:
         errors = reason.errors(include_url=False, include_input=False)
-        problems = [_diagnostic(root, error) for error in _without_misspelled(errors[: codes.MAX_DIAGNOSTICS])]
+        problems = [_diagnostic(root, error) for error in _without_misspelled(root, errors[: codes.MAX_DIAGNOSTICS])]
         if len(errors) > codes.MAX_DIAGNOSTICS:
             problems.append(codes.too_many(problems[-1].position))
         return Validated(None, tuple(problems))
 
 
-def _without_misspelled(errors: list[ErrorDetails]) -> list[ErrorDetails]:
-    """Without keys that are missing because they are misspelled: the unknown key is the mistake."""
+def _without_misspelled(root: MappingNode, errors: list[ErrorDetails]) -> list[ErrorDetails]:
+    """Without keys that are missing because they are misspelled, or come with a merge key: that is the mistake."""
     meant = {
         (*parent, near)
         for *parent, wrong in (error["loc"] for error in errors if error["type"] == "extra_forbidden")
         for near in _meant(str(wrong), _known_keys(parent))
     }
-    return [error for error in errors if error["type"] != "missing" or error["loc"] not in meant]
+    return [
+        error
+        for error in errors
+        if error["type"] != "missing" or not (error["loc"] in meant or _is_partial(root, error["loc"][:-1]))
+    ]
+
+
+def _is_partial(root: MappingNode, path: tuple[int | str, ...]) -> bool:
+    tree: Tree | None = root
+    for part in path:
+        if tree is None:
+            return False
+        tree = child(tree, part)
+    return isinstance(tree, MappingNode) and tree.is_partial
 
 
 def _meant(wrong: str, known: Sequence[str]) -> tuple[str, ...]:

@@ -53,6 +53,12 @@ _WHOLE_FILES = {
 }
 
 
+def test_keys_that_a_merge_key_was_to_bring_are_not_also_missing(tmp_path: Path) -> None:
+    found = load_text(tmp_path, HEAD + "topics:\n  a: &a {priority: 1}\n  b: {<<: *a}\n  c: {}\n").diagnostics
+    problems = [(item.code, item.path) for item in found if item.path.startswith("topics") or item.code == "INV005"]
+    assert sorted(problems) == [("INV005", ""), ("INV022", "topics.c")]
+
+
 @pytest.mark.parametrize("name", _WHOLE_FILES)
 def test_an_invalid_inventory_file_is_rejected_with_its_location(name: str, tmp_path: Path) -> None:
     text, code, line, column = _WHOLE_FILES[name]

@@ -39,6 +39,22 @@ def test_a_line_shows_known_values_and_masks_secrets(line: str, shown: str) -> N
 
 
 @pytest.mark.parametrize(
+    ("line", "shown"),
+    [
+        ("  other: {<<: *shared, ssid: x}", "  other: {<<: *shared, ssid: x}"),
+        ("    <<: *shared", "    <<: *shared"),
+        ("    ssid: HUNTER2", "    ssid: ***"),
+        ("    key: HUNTER2", "    key: ***"),
+        ("    HUNTER2: HUNTER2", "    ***: ***"),
+    ],
+)
+def test_keys_that_are_refused_are_shown_and_their_values_masked(line: str, shown: str) -> None:
+    """A merge key, or one that is there twice: the excerpt of such a finding was `***: ***`."""
+    text = f"meshes:\n  a: &shared {{ssid: a}}\n  b:\n    key: {{env: KEY}}\n    ssid: b\n    HUNTER2: 1\n{line}\n"
+    assert Excerpts(text).line(7, 0) == (shown, 0)
+
+
+@pytest.mark.parametrize(
     "text",
     [
         "mesh: HUNTER2\nudp:\n  - HUNTER2\n",
