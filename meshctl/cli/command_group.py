@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import inspect
 import re
 import sys
+import textwrap
 from pathlib import Path
 from typing import Any, ClassVar, get_args, get_origin
 
 from typer import BadParameter
 from typer.core import TyperArgument, TyperCommand, TyperGroup
 
+_MIN_EXAMPLE_WIDTH = 20
 _METAVARS = {Path: "PATH", int: "N", float: "NUMBER"}
 
 
@@ -21,12 +24,39 @@ class Command(TyperCommand):
         for parameter in self.params:
             _name_value(parameter)
 
+    def format_help_text(self, ctx: Any, formatter: Any) -> None:
+        """Folds the example as a shell reads it: copied from a narrow terminal, it is still one command."""
+        whole = self.help
+        self.help, *examples = inspect.cleandoc(whole or "").split("\n\nExample: ")
+        try:
+            super().format_help_text(ctx, formatter)
+        finally:
+            self.help = whole
+        for example in examples:
+            formatter.write_paragraph()
+            with formatter.indentation():
+                formatter.write(_folded(f"Example: {' '.join(example.split())}", formatter) + "\n")
+
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         try:
             return super().parse_args(ctx, args)
         except BadParameter as error:
             error.message = _reworded(error)
             raise
+
+
+def _folded(command: str, formatter: Any) -> str:
+    indent = " " * formatter.current_indent
+    width = max(formatter.width - len(" \\"), _MIN_EXAMPLE_WIDTH)
+    lines = textwrap.wrap(
+        command,
+        width,
+        initial_indent=indent,
+        subsequent_indent=2 * indent,
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
+    return " \\\n".join(lines)
 
 
 # pydantic's messages: newer typers check values with it
