@@ -255,16 +255,13 @@ def drift(
 
 
 def facts_object(facts: RobotFacts) -> dict[str, Any]:
-    """As JSON: every field by name, and the derived values."""
-    fields = dataclasses.asdict(facts)
-    return {
-        **fields,
-        "well": facts.is_healthy,
-        "answers": facts.answers,
-        "online": list(facts.online),
-        "remark": facts.remark,
-        "reached_through": list(facts.reached_through),
-    }
+    """As JSON: every field by name, and the derived values; null is unknown, such as all of a silent computer."""
+    unknown = ("seen_s", "is_proven", "unkeyed", "drift", "service") if facts.error else ()
+    fields = {**dataclasses.asdict(facts), **dict.fromkeys(unknown)}
+    if facts.computer == ComputerFacts():
+        fields["computer"] = dict.fromkeys(fields["computer"])
+    derived = {"well": facts.is_healthy, "answers": facts.answers, "online": list(facts.online), "remark": facts.remark}
+    return {**fields, **derived, "reached_through": list(facts.reached_through)}
 
 
 def _sections(text: str) -> dict[str, list[str]]:

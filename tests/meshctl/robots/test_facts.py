@@ -105,6 +105,17 @@ def test_one_answer_has_service_release_daemon_and_computer() -> None:
     assert json.loads(json.dumps(facts_object(facts)))["peers"][0]["name"] == "base"
 
 
+def test_what_a_silent_computer_leaves_unknown_is_null_in_json() -> None:
+    """Scripts read `is_proven: true` and a disk of 0 KiB."""
+    shown = facts_object(RobotFacts("husky1", error="cannot connect"))
+    assert [shown[key] for key in ("seen_s", "is_proven", "unkeyed", "drift", "service")] == [None] * 5
+    assert set(shown["computer"].values()) == {None}
+    assert {"cpus", "disk_free_kib", "clock_ahead_s"} < set(shown["computer"])
+    assert (shown["well"], shown["answers"], shown["error"]) == (False, False, "cannot connect")
+    answered = facts_object(_facts())
+    assert (answered["is_proven"], answered["drift"], answered["computer"]["cpus"]) == (True, (), 4)
+
+
 def test_peers_behind_relays_show_the_way() -> None:
     routes = [
         {"name": "base", "via": ["husky2", "b07"], "in_use": True},
