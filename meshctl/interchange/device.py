@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
 from meshctl.device.observation import Observation, WirelessLink
@@ -20,6 +20,9 @@ MARKER = f"/{MARKER_PATH}"
 EMPTY_EXPORT = "IMP001"
 # without which there is nothing to import
 _ESSENTIAL = frozenset({"network", "system", "wireless"})
+# a line of `uci show`, and the first line of a package of `uci export`
+_SHOWN = re.compile(r"^[a-z0-9_]+\.[@\w\[\]-]+(\.\w+)?=", re.MULTILINE)
+_PACKAGE = re.compile(r"^package ", re.MULTILINE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,13 +119,27 @@ def observed_device(observation: Observation) -> ExistingDevice:
 
 def exported_device(text: str, file: str, *, release: Release, board: str, target: str) -> ExistingDevice:
     """The device of a recorded `uci export`, which names neither board nor release. Raises InvalidInput."""
-    packages = {package.name: package for package in parse_export(text, file)}
+    try:
+        packages = {package.name: package for package in parse_export(text, file)}
+    except InvalidInput as reason:
+        raise InvalidInput(
+            [replace(each, hint=each.hint or _recording_hint(text)) for each in reason.diagnostics]
+        ) from None
     if not packages:
         expected = "the output of `uci export`, which starts with `package NAME`"
         raise InvalidInput(
             [Diagnostic(EMPTY_EXPORT, Severity.ERROR, Position(file, 1), "", expected=expected, found="no package")]
         )
     return ExistingDevice(packages, release, board, target)
+
+
+def _recording_hint(text: str) -> str:
+    """How to record a device, if the text is no `uci export`; else nothing."""
+    if _SHOWN.search(text):
+        return "this is the output of `uci show`: record the device with `uci export`"
+    if not _PACKAGE.search(text):
+        return "record the device with `uci export`: a file of /etc/config does not name its package"
+    return ""
 
 
 def release_of(version: str) -> Release:

@@ -14,7 +14,7 @@ from typer.testing import CliRunner, Result
 from meshctl.cli.main import build
 from meshctl.diagnostics import InvalidInput
 from meshctl.errors import InputError
-from meshctl.interchange.device import ExistingDevice, observed_device, release_of
+from meshctl.interchange.device import ExistingDevice, exported_device, observed_device, release_of
 from meshctl.interchange.device_differences import Fate, compare
 from meshctl.interchange.interfaces import bridge_ports
 from meshctl.interchange.new_inventory import load_text, new_text
@@ -236,6 +236,23 @@ def test_wrong_input_changes_nothing(words: tuple[str, ...], message: str, fleet
     assert done.exit_code == 2, done.output
     assert message in done.output
     assert (fleet / "fleet.yaml").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("text", "hint"),
+    [
+        ("network.lan=interface\nnetwork.lan.proto='static'\n", "this is the output of `uci show`"),
+        ("wireless.@wifi-iface[0]=wifi-iface\n", "this is the output of `uci show`"),
+        ("\nconfig interface 'lan'\n\toption proto 'static'\n", "does not name its package"),
+        ("package network\n\nconfig interface 'lan'\n\toption\n", ""),
+    ],
+)
+def test_a_file_that_is_no_uci_export_says_how_to_record_one(text: str, hint: str) -> None:
+    with pytest.raises(InvalidInput) as refused:
+        exported_device(text, "roof.uci", release=Release.V24_10, board="x", target="")
+    (found,) = refused.value.diagnostics
+    assert hint in found.hint
+    assert bool(found.hint) == bool(hint)
 
 
 def test_a_device_without_a_country_or_a_static_address_says_which_option_helps(tmp_path: Path) -> None:
