@@ -84,9 +84,10 @@ class MessageOutcome(NamedTuple):
 
 
 def encode_frame(header: Header, payload: Union[bytes, memoryview] = b"") -> bytes:
-    """Encodes one frame."""
+    """Encodes one frame. Raises TypeError for a payload that is no buffer of bytes."""
     head = json.dumps(header, separators=(",", ":")).encode()
-    return b"".join((_LENGTHS.pack(len(head), len(payload)), head, payload))
+    data = memoryview(payload)  # `len` of an array, such as an image, is not its size in bytes
+    return b"".join((_LENGTHS.pack(len(head), data.nbytes), head, data))
 
 
 class FrameReader:

@@ -1,9 +1,18 @@
 """Checks of settings that a program passes: dataclasses do not check types, and text is also a sequence."""
 
+import dataclasses
 from collections.abc import Sequence
 from enum import Enum
+from numbers import Integral, Real
+from types import UnionType
+from typing import TYPE_CHECKING, Any, Literal, Union, cast, get_args, get_origin
 
 from udp_mesh.wire.limits import MAX_TYPE_BYTES
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+_NUMBERS: dict[type, type] = {int: Integral, float: Real}
 
 
 def is_name(name: str, limit_bytes: int) -> bool:
@@ -27,8 +36,8 @@ def check_name(name: str, what: str, limit_bytes: int) -> None:
 
 
 def check_type(value: object, kind: type, what: str) -> None:
-    """Raises TypeError unless the value is of this type; `bool` is no `int`."""
-    if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
+    """Raises TypeError unless the value is of this type; `bool` is no number, and NumPy's numbers are some."""
+    if not isinstance(value, _NUMBERS.get(kind, kind)) or (kind in _NUMBERS and isinstance(value, bool)):
         raise TypeError(f"{what}: expected {_named(kind)}, found {_found(value)}")
 
 
@@ -38,6 +47,36 @@ def check_items(values: Sequence[object], kind: type, what: str) -> None:
         raise TypeError(f"{what}: expected a tuple of {kind.__name__}, found {_found(values)}")
     for value in values:
         check_type(value, kind, what)
+
+
+def check_fields(settings: "DataclassInstance", what: str = "") -> None:
+    """Raises TypeError if a field of the dataclass does not have the type that it declares; `what` is put before its
+    name. A whole number is accepted for a float, and a list for a tuple."""
+    for field in dataclasses.fields(settings):
+        _check(getattr(settings, field.name), field.type, f"{what}{field.name}")
+
+
+def _check(value: object, declared: Any, what: str) -> None:
+    origin, inner = get_origin(declared), get_args(declared)
+    if origin is Literal:
+        if value not in inner:
+            raise TypeError(f"{what}: expected {inner[0]!r}, found {_found(value)}")
+    elif origin in (Union, UnionType):
+        kinds = [kind for kind in inner if kind is not type(None)]
+        if value is None and len(kinds) < len(inner):
+            return
+        if get_origin(kinds[0]) is not Literal or value not in get_args(kinds[0]):
+            _check(value, kinds[-1], what)
+    elif origin is tuple and inner[1:] == (Ellipsis,):
+        check_items(cast(Any, value), inner[0], what)
+    elif origin is tuple:
+        if not isinstance(value, tuple | list) or len(value) != len(inner):
+            names = ", ".join(kind.__name__ for kind in inner)
+            raise TypeError(f"{what}: expected ({names}), found {_found(value)}")
+        for one, kind in zip(value, inner, strict=True):
+            check_type(one, kind, what)
+    else:
+        check_type(value, declared, what)
 
 
 def written(value: object) -> object:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import Literal
 
-from udp_mesh.core.setting_checks import check_items, check_name, check_type, written
+from udp_mesh.core.setting_checks import check_fields, check_name, written
 from udp_mesh.core.thin.settings import ThinSettings, check_thin
 from udp_mesh.crypto import Key
 from udp_mesh.wire.limits import (
@@ -88,7 +88,7 @@ class Log:
     copies: int = 3
 
     def __post_init__(self) -> None:
-        check_items(self.readers, str, "log.readers")
+        check_fields(self, "log.")
         for name in ("max_items", "max_bytes"):
             if getattr(self, name) < 1:
                 raise ValueError(f"log.{name}: expected at least 1, found {getattr(self, name)}")
@@ -137,10 +137,7 @@ class Topic:
 
     def __post_init__(self) -> None:
         check_name(self.name, "topic", MAX_TOPIC_BYTES)
-        check_type(self.priority, int, f"topic {self.name}: priority")
-        check_type(self.outbox, Outbox, f"topic {self.name}: outbox")
-        check_items(self.destinations, str, f"topic {self.name}: destinations")
-        check_items(self.links, str, f"topic {self.name}: links")
+        check_fields(self, f"topic {self.name}: ")
         if not 0 <= self.priority < PRIORITY_LEVELS:
             raise ValueError(f"topic {self.name}: expected a priority of 0 to 15, found {self.priority}")
         if self.keep_last is not None and self.keep_last < 1:
@@ -194,6 +191,7 @@ class Neighbour:
     legacy: bool = False
 
     def __post_init__(self) -> None:
+        check_fields(self, "neighbor ")
         if self.legacy and self.name is None:
             raise ValueError(f"neighbor {self.address[0]}: legacy requires a name")
 
@@ -218,8 +216,7 @@ class RelaySettings:
         return self.hops > 1 and (self.all or bool(self.names))
 
     def __post_init__(self) -> None:
-        check_items(self.names, str, "relay")
-        check_items(self.keys, Key, "relay keys")
+        check_fields(self, "relay ")
         for name in self.names:
             check_name(name, "relay", MAX_NAME_BYTES)
         if not 1 <= self.hops <= MAX_RELAY_HOPS:
@@ -276,6 +273,7 @@ class Rates:
     """Maximum fraction of time for which a level may be held back, so that none starves."""
 
     def __post_init__(self) -> None:
+        check_fields(self, "rates.")
         times = (
             "heartbeat_s",
             "heartbeat_sparse_s",
@@ -328,6 +326,7 @@ class Limits:
     """The same for all peers, and as much for the versions sent."""
 
     def __post_init__(self) -> None:
+        check_fields(self, "limits.")
         for name in self.__slots__:
             if getattr(self, name) < 1:
                 raise ValueError(f"limits.{name}: expected at least 1, found {getattr(self, name)}")
@@ -365,12 +364,9 @@ class Settings:
         check_name(self.name, "name", MAX_NAME_BYTES)
         if "/" in self.name:
             raise ValueError(f"name {self.name!r}: expected no slash (names are parts of topic names)")
-        check_type(self.port, int, "port")
+        check_fields(self)
         if not 0 < self.port <= 65535:
             raise ValueError(f"port: expected 1 to 65535, found {self.port}")
-        check_items(self.keys, Key, "keys")
-        check_items(self.topics, Topic, "topics")
-        check_items(self.neighbours, Neighbour, "neighbours")
         if not self.keys and not self.unkeyed:
             raise ValueError("keys: expected a fleet key or an explicit unkeyed=True, found neither")
         if self.keys and self.unkeyed:

@@ -18,6 +18,7 @@ import random
 from collections import deque
 from collections.abc import AsyncIterator, Sequence
 from dataclasses import replace
+from ipaddress import ip_address
 from types import TracebackType
 
 from udp_mesh.core.conditions import Conditions
@@ -65,6 +66,7 @@ class Node:
         urgent_dscp: int = 46,
     ) -> None:
         check_items(links, LinkConfig, "links")
+        _check_addresses(settings)
         self._settings = replace(settings, confirms=True)
         self._links = tuple(links)
         self._store = store
@@ -90,7 +92,12 @@ class Node:
             store=self._store,
             urgent_dscp=self._urgent_dscp,
         )
-        self._driver.start()
+        try:
+            self._driver.start()
+        except BaseException:
+            # without an `async with` block, nothing else closes its sockets and timers
+            self._driver.close()
+            raise
         return self
 
     async def __aexit__(
@@ -172,6 +179,7 @@ class Node:
 
     def apply(self, settings: Settings) -> list[str]:
         """Changes topics, window, rates, limits, keys, neighbors. Drops no message. Raises ValueError."""
+        _check_addresses(settings)
         changes = self.driver.apply(replace(settings, confirms=True))
         self._settings = settings
         return changes
@@ -193,6 +201,15 @@ class Node:
                 future.set_result(event)
         self._events.append(event)
         self._happened.set()
+
+
+def _check_addresses(settings: Settings) -> None:
+    """Raises ValueError for a neighbor whose address is no IP address: names are not looked up."""
+    for neighbor in settings.neighbours:
+        try:
+            ip_address(neighbor.address[0])
+        except ValueError:
+            raise ValueError(f"neighbor: expected an IP address, found {neighbor.address[0]!r}") from None
 
 
 def _unchanging(payload: object) -> bytes:

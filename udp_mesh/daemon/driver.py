@@ -117,21 +117,22 @@ class Driver:
         """Sends goodbyes and the last datagrams, reports the last events, closes everything."""
         if self.closed:
             return
-        self.node.close(self._advance_clock())
-        self._transmit_all()
-        self._report_events()
-        self.closed = True
-        self._background.close()
-        self.output.close()
-        for handle in (self._timer, self._refresh_timer):
-            if handle is not None:
+        try:
+            self.node.close(self._advance_clock())
+            self._transmit_all()
+            self._report_events()
+        finally:
+            self.closed = True
+            self._background.close()
+            self.output.close()
+            for handle in filter(None, (self._timer, self._refresh_timer)):
                 handle.cancel()
-        if self._monitor is not None:
-            self._loop.remove_reader(self._monitor.fileno())
-            self._monitor.close()
-        for link in self.hub.links.values():
-            self._unwatch(link)
-        self.hub.close()
+            if self._monitor is not None:
+                self._loop.remove_reader(self._monitor.fileno())
+                self._monitor.close()
+            for link in self.hub.links.values():
+                self._unwatch(link)
+            self.hub.close()
 
     # Called by the application
 

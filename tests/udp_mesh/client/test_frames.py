@@ -3,7 +3,9 @@
 import ast
 import socket
 import sys
+from array import array
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -13,6 +15,20 @@ import udp_mesh.client.mesh_client as mesh_client
 from udp_mesh.client.mesh_client import Frame, FrameReader, MeshClient, MeshError, encode_frame
 
 headers = st.dictionaries(st.text(max_size=5), st.one_of(st.integers(), st.text(max_size=5), st.booleans()), max_size=3)
+
+
+def test_the_length_of_an_array_is_that_of_its_bytes() -> None:
+    """The rest of an image was read as the next request."""
+    samples: Any = array("d", [1.5, 2.5])
+    rows: Any = memoryview(bytes(6)).cast("B", (2, 3))
+    ((_, payload), (_, image)) = FrameReader().feed(encode_frame({}, samples) + encode_frame({}, rows))
+    assert (bytes(payload), bytes(image)) == (samples.tobytes(), bytes(6))
+
+
+@pytest.mark.parametrize("payload", ["text", None, 7, [1]])
+def test_a_payload_that_is_no_buffer_is_named(payload: Any) -> None:
+    with pytest.raises(TypeError, match="a bytes-like object is required, not "):
+        encode_frame({}, payload)
 
 
 @given(st.lists(st.tuples(headers, st.binary(max_size=50)), max_size=5), st.data())

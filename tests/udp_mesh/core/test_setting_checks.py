@@ -1,10 +1,11 @@
 """Settings from a program that has no type checker: a wrong type is an error where it is written."""
 
+from collections.abc import Callable
 from typing import Any
 
 import pytest
 
-from udp_mesh.core.settings import Log, Outbox, RelaySettings, Settings, Topic
+from udp_mesh.core.settings import Limits, Log, Neighbour, Outbox, Rates, RelaySettings, Settings, Topic
 from udp_mesh.crypto import Key
 
 KEY = Key(bytes(range(32)))
@@ -17,6 +18,11 @@ KEY = Key(bytes(range(32)))
         ({"priority": 1.5}, r"topic map: priority: expected int, found 1.5 \(float\)"),
         ({"priority": "1"}, r"topic map: priority: expected int, found '1' \(str\)"),
         ({"destinations": "base"}, r"topic map: destinations: expected a tuple of str, found 'base' \(str\)"),
+        ({"reliable": "false"}, r"topic map: reliable: expected bool, found 'false' \(str\)"),
+        ({"keep_last": 1.5}, r"topic map: keep_last: expected int, found 1.5 \(float\)"),
+        ({"deadline_s": "1"}, r"topic map: deadline_s: expected float, found '1' \(str\)"),
+        ({"deadline_s": True}, r"topic map: deadline_s: expected float, found True \(bool\)"),
+        ({"log": ("base",)}, "topic map: log: expected Log, found tuple"),
         ({"links": "lora"}, "topic map: links: expected a tuple of str"),
         ({"name": b"map"}, "topic: expected str, found bytes"),
     ],
@@ -36,6 +42,8 @@ def test_a_topic_with_a_value_of_the_wrong_type_is_refused(values: dict[str, Any
         ({"topics": Topic("map")}, "topics: expected a tuple of Topic, found Topic"),
         ({"neighbours": (("127.0.0.1", 8700),)}, "neighbours: expected Neighbour, found tuple"),
         ({"port": "8700"}, "port: expected int, found '8700'"),
+        ({"window": "3"}, "window: expected int, found '3'"),
+        ({"limits": Rates()}, "limits: expected Limits, found Rates"),
         ({"name": 3}, r"name: expected str, found 3 \(int\)"),
     ],
 )
@@ -54,8 +62,22 @@ def test_text_in_place_of_a_list_of_names_is_not_taken_for_letters() -> None:
     name: Any = "base"
     with pytest.raises(TypeError, match=r"log.readers: expected a tuple of str"):
         Log(readers=name)
-    with pytest.raises(TypeError, match="relay: expected a tuple of str"):
+    with pytest.raises(TypeError, match="relay names: expected a tuple of str"):
         RelaySettings(names=name)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda wrong: Rates(heartbeat_s=wrong), r"rates.heartbeat_s: expected float, found '1' \(str\)"),
+        (lambda wrong: Limits(peers=wrong), "limits.peers: expected int, found '1'"),
+        (lambda wrong: Neighbour(wrong), r"neighbor address: expected \(str, int\), found '1'"),
+        (lambda wrong: Neighbour(("127.0.0.1", wrong)), "neighbor address: expected int, found '1'"),
+    ],
+)
+def test_parts_of_settings_are_checked_too(make: Callable[[Any], object], message: str) -> None:
+    with pytest.raises(TypeError, match=message):
+        make("1")
 
 
 def test_lists_are_accepted_in_place_of_tuples() -> None:

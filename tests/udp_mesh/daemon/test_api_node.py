@@ -182,3 +182,22 @@ def test_a_single_link_in_place_of_a_sequence_is_named() -> None:
     link: Any = LinkConfig(address="127.0.4.1")
     with pytest.raises(TypeError, match="links: expected a tuple of LinkConfig, found LinkConfig"):
         Node(Settings("alice", unkeyed=True), links=link)
+
+
+def test_a_neighbor_needs_an_ip_address() -> None:
+    """Nothing was ever sent to `localhost`, without a word."""
+    neighbor = Neighbour(("localhost", 8700))
+    with pytest.raises(ValueError, match="neighbor: expected an IP address, found 'localhost'"):
+        Node(Settings("alice", unkeyed=True, neighbours=(neighbor,)))
+
+
+def test_a_node_that_cannot_start_leaves_no_socket_and_no_timer() -> None:
+    async def main() -> None:
+        wrong: Any = "no number"
+        link = LinkConfig(address="127.0.4.1", broadcast=False)
+        node = Node(Settings("alice", port=free_port(), unkeyed=True), links=(link,), urgent_dscp=wrong)
+        with pytest.raises(TypeError):
+            await node.__aenter__()
+        assert node.driver.closed
+
+    asyncio.run(main())
