@@ -1,8 +1,9 @@
 """Checks of settings that a program passes: dataclasses do not check types, and text is also a sequence."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from enum import Enum
+from functools import cache
 from numbers import Integral, Real
 from types import UnionType
 from typing import TYPE_CHECKING, Any, Literal, Union, cast, get_args, get_origin
@@ -52,8 +53,27 @@ def check_items(values: Sequence[object], kind: type, what: str) -> None:
 def check_fields(settings: "DataclassInstance", what: str = "") -> None:
     """Raises TypeError if a field of the dataclass does not have the type that it declares; `what` is put before its
     name. A whole number is accepted for a float, and a list for a tuple."""
-    for field in dataclasses.fields(settings):
-        _check(getattr(settings, field.name), field.type, f"{what}{field.name}")
+    for name, declared, usual in _fields(type(settings)):
+        value = getattr(settings, name)
+        # a topic is made for each message on one that is not declared
+        if type(value) not in usual and not (value == () and Ellipsis in get_args(declared)):
+            _check(value, declared, f"{what}{name}")
+
+
+@cache
+def _fields(settings: "type[DataclassInstance]") -> tuple[tuple[str, Any, frozenset[type]], ...]:
+    """The name and the declared type of each field, and the types of values that need no further check."""
+    return tuple((field.name, field.type, frozenset(_usual(field.type))) for field in dataclasses.fields(settings))
+
+
+def _usual(declared: Any) -> Iterator[type]:
+    if get_origin(declared) in (Union, UnionType):
+        for kind in get_args(declared):
+            yield from _usual(kind)
+    elif declared is float:
+        yield from (int, float)
+    elif isinstance(declared, type) and get_origin(declared) is None:
+        yield declared
 
 
 def _check(value: object, declared: Any, what: str) -> None:

@@ -19,6 +19,7 @@ KEY = Key(bytes(range(32)))
         ({"priority": "1"}, r"topic map: priority: expected int, found '1' \(str\)"),
         ({"destinations": "base"}, r"topic map: destinations: expected a tuple of str, found 'base' \(str\)"),
         ({"reliable": "false"}, r"topic map: reliable: expected bool, found 'false' \(str\)"),
+        ({"reliable": ()}, "topic map: reliable: expected bool, found tuple"),
         ({"keep_last": 1.5}, r"topic map: keep_last: expected int, found 1.5 \(float\)"),
         ({"deadline_s": "1"}, r"topic map: deadline_s: expected float, found '1' \(str\)"),
         ({"deadline_s": True}, r"topic map: deadline_s: expected float, found True \(bool\)"),
