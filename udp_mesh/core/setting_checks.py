@@ -53,17 +53,21 @@ def check_items(values: Sequence[object], kind: type, what: str) -> None:
 def check_fields(settings: "DataclassInstance", what: str = "") -> None:
     """Raises TypeError if a field of the dataclass does not have the type that it declares; `what` is put before its
     name. A whole number is accepted for a float, and a list for a tuple."""
-    for name, declared, usual in _fields(type(settings)):
+    for name, declared, usual, may_be_empty in _fields(type(settings)):
         value = getattr(settings, name)
         # a topic is made for each message on one that is not declared
-        if type(value) not in usual and not (value == () and Ellipsis in get_args(declared)):
+        if type(value) not in usual and not (may_be_empty and value == ()):
             _check(value, declared, f"{what}{name}")
 
 
 @cache
-def _fields(settings: "type[DataclassInstance]") -> tuple[tuple[str, Any, frozenset[type]], ...]:
-    """The name and the declared type of each field, and the types of values that need no further check."""
-    return tuple((field.name, field.type, frozenset(_usual(field.type))) for field in dataclasses.fields(settings))
+def _fields(settings: "type[DataclassInstance]") -> tuple[tuple[str, Any, frozenset[type], bool], ...]:
+    """The name and the declared type of each field, the types of values that need no further check, and whether it is a
+    tuple of any length."""
+    return tuple(
+        (field.name, field.type, frozenset(_usual(field.type)), Ellipsis in get_args(field.type))
+        for field in dataclasses.fields(settings)
+    )
 
 
 def _usual(declared: Any) -> Iterator[type]:
