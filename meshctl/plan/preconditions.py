@@ -187,7 +187,8 @@ def _other_operator(case: _Checked) -> FailedPrecondition | None:
         return None
     if change.lock_owner and change.lock_owner != case.owner:
         left = f" for {change.lock_left_s:.0f} more seconds" if change.lock_left_s else ""
-        return FailedPrecondition(f"locked by {lock_owners(change.lock_owner)}{left}")
+        hint = "wait until the other run ends or its lock expires"
+        return FailedPrecondition(f"locked by {lock_owners(change.lock_owner)}{left}", hint)
     if change.state in ("armed", "waiting", "applied", "restoring") and change.owner != case.owner:
         return FailedPrecondition(
             f"{lock_owners(change.owner) or 'another operator'} has a change {change.state} on it",

@@ -135,6 +135,13 @@ def test_a_radio_at_another_path_is_refused() -> None:
     assert "wrong device path of radio0: expected platform/ahb/18100000.wmac" in plan.reason
 
 
+def test_a_lock_of_another_run_says_what_to_do() -> None:
+    seen = running(fleet(), "b01", change=ChangeStatus("idle", lock_owner="bob@laptop:17:4711", lock_left_s=42.0))
+    assert (
+        planned(fleet(), "b01", seen, owner="alice@base:7").hint == "wait until the other run ends or its lock expires"
+    )
+
+
 def test_our_own_lock_does_not_block_the_plan() -> None:
     seen = running(fleet(), "b01", change=ChangeStatus("idle", lock_owner="alice@base:7", lock_left_s=42.0))
     assert planned(fleet(), "b01", seen, owner="alice@base:7").verdict is Verdict.SAME
