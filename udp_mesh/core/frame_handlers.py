@@ -46,6 +46,7 @@ def process_frames(
     sender = peer.open_sender()
     wants_ack = ack_now = False
     kept = True
+    duplicates = receiver.duplicates - receiver.fragments
     for frame in frames:
         match frame:
             case Fragment():
@@ -101,7 +102,9 @@ def process_frames(
     elif kept and deferred is not None:
         deferred.numbers.append(number)
     elif kept:
-        receiver.on_accepted(number, now, ack_now=ack_now)
+        # A copy that brings nothing new does not call for an acknowledgment of its own: the next one covers it.
+        is_new = receiver.duplicates - receiver.fragments != duplicates
+        receiver.on_accepted(number, now, ack_now=ack_now and is_new)
         if receiver.acks.send_now:
             state.schedule_control(session)
             if receiver.ack_overdue():

@@ -61,6 +61,10 @@ class CongestionController(Protocol):
         """Whether the link can be assumed to keep delivering while acknowledgments are late."""
         ...
 
+    def is_queue_explained(self) -> bool:
+        """Whether the queue is no longer than our own window explains."""
+        ...
+
 
 class FixedWindow:
     """A constant window, as in the paper."""
@@ -104,4 +108,7 @@ class FixedWindow:
         return False
 
     def assume_delivery(self) -> bool:
+        return False
+
+    def is_queue_explained(self) -> bool:
         return False

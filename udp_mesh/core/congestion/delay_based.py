@@ -39,6 +39,9 @@ MIN_CWND = 4.0
 """Packets: below this, a lost packet has too few successors to be detected without a timeout. On a lossy path so many
 must be acknowledged: packets and acknowledgments are both lost, so the minimum is this divided by (1 - loss)²."""
 
+MIN_CWND_SLACK = 1.02
+"""The loss changes between two updates: a window of so many times the minimum is the smallest."""
+
 MAX_CWND = 8192.0
 """Packets: 92 Mbit at 1400 B, more than any link of these robots needs. Bounds the state per packet."""
 
@@ -171,7 +174,10 @@ class DelayBasedController:
 
     def assume_delivery(self) -> bool:
         # A queue that our window does not explain keeps the link busy anyway, and a drain wants the queue empty.
-        return bool(self._rate) and self.phase in (Phase.STARTUP, Phase.CRUISE) and not self._unexplained_queue()
+        return bool(self._rate) and self.phase in (Phase.STARTUP, Phase.CRUISE) and self.is_queue_explained()
+
+    def is_queue_explained(self) -> bool:
+        return not self._unexplained_queue()
 
     @property
     def undrained_cwnd(self) -> float:
@@ -262,11 +268,11 @@ class DelayBasedController:
 
     def _unexplained_queue(self) -> bool:
         min_rtt, windowed_rtt = self._rtt.min_rtt, self._rtt.windowed_rtt
-        return (
-            min_rtt is not None
-            and windowed_rtt is not None
-            and windowed_rtt - min_rtt > SUSPECT_QUEUE_S + 0.25 * min_rtt
-        )
+        if min_rtt is None or windowed_rtt is None:
+            return False
+        # On a short lossy path the smallest window is a queue by itself.
+        explained_s = max(0.0, self._min_cwnd() / (self.capacity_packets_per_s() or float("inf")) - min_rtt)
+        return windowed_rtt - min_rtt > explained_s + SUSPECT_QUEUE_S + 0.25 * min_rtt
 
     def _min_rtt_is_verified(self) -> bool:
         """Whether the minimum RTT was seen with next to nothing in flight; otherwise it may include a standing
@@ -306,7 +312,9 @@ class DelayBasedController:
         is_verified = self._min_rtt_is_verified() and not self._competition.is_suspected
         every_round_trips = DRAIN_ROUND_TRIPS if is_verified else UNVERIFIED_DRAIN_ROUND_TRIPS
         interval_s = DRAIN_INTERVAL_S / 2 if self._competition.is_suspected else DRAIN_INTERVAL_S
-        if since_drain > max(interval_s, every_round_trips * min_rtt):
+        # The smallest window stays as it is, whatever a drain finds.
+        is_smallest = self.cwnd <= MIN_CWND_SLACK * self._min_cwnd()
+        if since_drain > max(interval_s, every_round_trips * min_rtt) and not is_smallest:
             if not self._suspect_rounds and is_verified and (app_limited or windowed_rtt - min_rtt < QUEUE_S / 4):
                 self._drained_at = now
             else:
@@ -433,4 +441,4 @@ class DelayBasedController:
             return
         base = min(hold_min_rtt, self._windowed_rtt_before_drain) if hold_min_rtt != float("inf") else min_rtt
         queue = self._shared_queue(self._target_queue_s(), throughput)
-        self.cwnd = min(max_cwnd, MAX_CWND, max(MIN_CWND, throughput * base + queue))
+        self.cwnd = min(max_cwnd, MAX_CWND, max(self._min_cwnd(), throughput * base + queue))

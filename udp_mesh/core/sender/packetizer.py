@@ -146,7 +146,7 @@ def send_copies(sender: Sender, path: Path, now: float, out: list[Datagram]) -> 
             path,
             [(message, position)],
             [*_frames(sender, path, run, now, ack_now=True)],
-            sender.snapshot(now, urgent=True),
+            sender.snapshot(now, urgent=True)._replace(copy=True),
             out,
         )
 

@@ -22,6 +22,9 @@ EARLY_COPIES = ((0.1, 3), (0.15, 6))
 """(loss, gaps): from this loss rate on, one more copy is sent so many gaps after the first. Losses come in bursts, so
 the gaps grow."""
 
+ANSWER_GAPS = 3
+"""An early copy is left out if the answer is overdue at most so many gaps later: then comes one only if needed."""
+
 
 class RedundantCopies:
     """The copies scheduled for one peer."""
@@ -56,7 +59,8 @@ class RedundantCopies:
             return
         self._push(now + gap_s, message, position, 0)
         for min_loss, gaps in EARLY_COPIES:
-            if loss >= min_loss:
+            is_awaited = message.reliable and urgent_timeout_s <= (gaps + ANSWER_GAPS) * gap_s
+            if loss >= min_loss and not is_awaited:
                 self._push(now + gaps * gap_s, message, position, 0)
         if message.reliable:
             self._push(now + urgent_timeout_s, message, position, MAX_OVERDUE_COPIES - 1)

@@ -33,27 +33,38 @@ MAX_URGENT_WAIT_S = 0.1
 datagram with all small waiting fragments delays bulk by a hundredth."""
 
 ASSUMED_DELIVERY_S = 0.03
-"""How long delivery is assumed to continue; bounds the queue this may build."""
+"""How long delivery is assumed to continue; bounds the queue this may build, that of the window itself included."""
 
 
 def cwnd_room(sender: Sender, now: float) -> int:
     """Packets that the window has room for; negative if more are in flight."""
     congestion = sender.congestion
     packets = congestion.cwnd
-    if sender.state is SendState.TIMING_OUT:
-        # Packets now leave the window by their age only, so more of them are in flight than within one round trip.
-        smoothed_rtt = sender.rtt.smoothed_rtt
-        if smoothed_rtt is not None and congestion.assume_delivery():
-            packets *= max(1.0, sender.pto_s() / smoothed_rtt)
-    else:
-        late_s = now - _late_at(sender)
-        if late_s > 0 and congestion.assume_delivery():
-            packets += (congestion.capacity_packets_per_s() or 0.0) * min(late_s, ASSUMED_DELIVERY_S)
+    if congestion.assume_delivery():
+        packets = _with_assumed_delivery(sender, packets, now)
+    if congestion.is_queue_explained():
+        # Copies are few and small. While the queue is longer than we know why, they take the place of bulk.
+        packets += sender.in_flight.copies
     room = int(packets) - sender.in_flight.outstanding
     if room <= 0 and congestion.drain_overdue(now):
         # A drain ends with the round trip of a packet that is not urgent: one may be sent whatever else is in flight.
         room = max(room, 1 - sender.in_flight.non_urgent_outstanding())
     return room
+
+
+def _with_assumed_delivery(sender: Sender, cwnd: float, now: float) -> float:
+    """The window, and what the link should have delivered meanwhile, unless the window is such a queue by itself."""
+    smoothed_rtt, min_rtt = sender.rtt.smoothed_rtt, sender.rtt.min_rtt
+    capacity = sender.congestion.capacity_packets_per_s()
+    if smoothed_rtt is None or min_rtt is None or capacity is None:
+        return cwnd
+    packets = cwnd
+    if sender.state is SendState.TIMING_OUT:
+        # Packets now leave the window by their age only, so more of them are in flight than within one round trip.
+        packets *= sender.pto_s() / smoothed_rtt
+    else:
+        packets += capacity * min(now - _late_at(sender), ASSUMED_DELIVERY_S)
+    return max(cwnd, min(packets, capacity * (min_rtt + ASSUMED_DELIVERY_S)))
 
 
 def send_quota(sender: Sender, room: int, now: float, packets_per_s: float | None, *, urgent: bool) -> int:

@@ -40,6 +40,8 @@ class SendSnapshot(NamedTuple):
     """Number of the burst's first packet."""
     outstanding: int = 0
     """Packets in flight when it was sent."""
+    copy: bool = False
+    """A redundant copy of an urgent fragment."""
 
     def packets_ahead_of(self, number: int) -> int:
         """Packets in flight when packet `number` of the burst was sent."""
@@ -56,7 +58,7 @@ class Packet(NamedTuple):
 
 
 class SentPackets:
-    """`outstanding` counts the packets neither acknowledged nor lost."""
+    """`outstanding` counts the packets neither acknowledged nor lost, `copies` the redundant copies among them."""
 
     __slots__ = (
         "_largest_other",
@@ -64,6 +66,7 @@ class SentPackets:
         "_packets",
         "_timed_out",
         "base",
+        "copies",
         "outstanding",
         "reorder_packets",
         "spurious",
@@ -75,7 +78,7 @@ class SentPackets:
         self._packets: deque[Packet | None] = deque()
         self._largest_other = -1
         """Largest acknowledged number of a packet that was not urgent."""
-        self.outstanding = 0
+        self.outstanding = self.copies = 0
         self.reorder_packets = REORDER_PACKETS
         self._lost: OrderedDict[int, tuple[Packet, bool]] = OrderedDict()
         self._timed_out: list[int] = []
@@ -98,6 +101,7 @@ class SentPackets:
             self.base = number if packet is not None else number + 1
         if packet is not None:
             self.outstanding += 1
+            self.copies += packet.snapshot.copy
         elif not packets:
             return
         packets.append(packet)
@@ -139,7 +143,7 @@ class SentPackets:
                 if packet is not None:
                     acknowledged.append(packet)
             self.base = largest + 1
-            self.outstanding -= len(acknowledged) - corrected
+            self._count_out(acknowledged[corrected:])
             return acknowledged, lost, newest
         reorder = self.reorder_packets
         for behind in range(count):
@@ -168,7 +172,8 @@ class SentPackets:
             if packet is not None and received >> behind & 1:
                 acknowledged.append(packet)
                 packets[count - 1 - behind] = None
-        self.outstanding -= len(acknowledged) - corrected + len(lost)
+        self._count_out(acknowledged[corrected:])
+        self._count_out(lost)
         return acknowledged, lost, newest
 
     def confirm_timed_out(self, largest: int, received: int) -> int:
@@ -190,7 +195,7 @@ class SentPackets:
         self._packets.clear()
         # An outage says nothing about the loss rate of the path.
         self._timed_out.clear()
-        self.outstanding = 0
+        self.outstanding = self.copies = 0
         return lost
 
     def restart(self, number: int) -> list[Packet]:
@@ -201,7 +206,7 @@ class SentPackets:
         self._largest_other = -1
         self._timed_out.clear()
         self.base = number
-        self.outstanding = 0
+        self.outstanding = self.copies = 0
         return lost
 
     def oldest(self) -> SendSnapshot | None:
@@ -228,8 +233,14 @@ class SentPackets:
                     self._timed_out.append(self.base)
             packets.popleft()
             self.base += 1
-        self.outstanding -= len(lost)
+        self._count_out(lost)
         return lost
+
+    def _count_out(self, packets: list[Packet]) -> None:
+        """Packets that are no longer in flight."""
+        self.outstanding -= len(packets)
+        if self.copies:
+            self.copies -= sum(packet.snapshot.copy for packet in packets)
 
     def _remember(self, number: int, packet: Packet, *, overtaken: bool) -> None:
         self._lost[number] = (packet, overtaken)

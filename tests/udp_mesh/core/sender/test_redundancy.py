@@ -10,7 +10,7 @@ from udp_mesh.core.sender.message import AcceptedMessage, OutgoingMessage, Topic
 from udp_mesh.core.sender.redundancy import EARLY_COPIES, MAX_OVERDUE_COPIES, RedundantCopies
 from udp_mesh.core.settings import Topic
 
-GAP_S, OVERDUE_S = 0.003, 0.025
+GAP_S, OVERDUE_S = 0.003, 0.030
 EARLY_S = [GAP_S, *(gaps * GAP_S for _, gaps in EARLY_COPIES)]
 
 
@@ -22,16 +22,23 @@ def fragment(*, reliable: bool = True) -> OutgoingMessage:
     return message
 
 
-def sendings(message: OutgoingMessage, *, twice: bool, loss: float, answered_at: float = float("inf")) -> list[float]:
+def sendings(
+    message: OutgoingMessage,
+    *,
+    twice: bool,
+    loss: float,
+    answered_at: float = float("inf"),
+    overdue_s: float = OVERDUE_S,
+) -> list[float]:
     """When copies of a fragment sent at 0 are due."""
     copies = RedundantCopies()
-    copies.schedule(message, 0, 0.0, gap_s=GAP_S, twice=twice, loss=loss, urgent_timeout_s=OVERDUE_S)
+    copies.schedule(message, 0, 0.0, gap_s=GAP_S, twice=twice, loss=loss, urgent_timeout_s=overdue_s)
     times = []
     while copies:
         at = copies.next_at()
         if at >= answered_at:
             message.arrived[0] = 1
-        times += [at for _ in copies.pop_due(at, OVERDUE_S)]
+        times += [at for _ in copies.pop_due(at, overdue_s)]
     return times
 
 
@@ -43,6 +50,14 @@ def test_higher_loss_sends_more_early_copies_of_an_urgent_fragment() -> None:
     assert early == [0, 1, 2, 3]
     assert sendings(fragment(), twice=False, loss=0.0) == []
     assert sendings(fragment(), twice=True, loss=0.2)[:3] == pytest.approx(EARLY_S)
+
+
+def test_no_early_copy_is_sent_shortly_before_the_answer_is_overdue() -> None:
+    times = sendings(fragment(), twice=True, loss=0.2, overdue_s=0.025)
+    assert times[:3] == pytest.approx([*EARLY_S[:2], 0.025])
+    # Nothing is awaited of a best-effort message.
+    message = fragment(reliable=False)
+    assert sendings(message, twice=True, loss=0.2, overdue_s=0.025) == pytest.approx(EARLY_S)
 
 
 def test_an_overdue_acknowledgement_triggers_a_bounded_number_of_copies() -> None:

@@ -104,3 +104,19 @@ def test_bursty_loss_of_acknowledgements_barely_reduces_goodput() -> None:
         return run.measure(12.0).goodput_bits_per_s
 
     assert sum(lost_in_bursts(seed) for seed in (1, 2, 3)) / 3 >= 0.90 * 0.8 * 10e6
+
+
+def test_copies_occupy_no_window() -> None:
+    sender, heard = busy_outbound()
+    before = cwnd_room(sender, heard)
+    sender.in_flight.copies += 2
+    assert cwnd_room(sender, heard) == before + 2
+
+
+def test_assumed_delivery_is_no_longer_queue_than_the_window_may_be() -> None:
+    sender, heard = busy_outbound()
+    capacity, min_rtt = sender.congestion.capacity_packets_per_s(), sender.rtt.min_rtt
+    assert capacity is not None
+    assert min_rtt is not None
+    packets = cwnd_room(sender, heard + 10.0) + sender.in_flight.outstanding
+    assert packets <= max(sender.congestion.cwnd, capacity * (min_rtt + ASSUMED_DELIVERY_S))

@@ -91,3 +91,21 @@ def test_an_urgent_packet_that_overtakes_a_whole_run_of_others_shows_no_loss() -
     acknowledged, lost, _ = sent.acknowledge(5, 1)
     assert (len(acknowledged), lost) == (1, [])
     assert sent.outstanding == 5
+
+
+def test_copies_in_flight_are_counted_until_they_are_decided() -> None:
+    copy = SNAPSHOT._replace(urgent=True, copy=True)
+    sent = SentPackets()
+    for number in range(8):
+        sent.add(number, Packet(copy if number % 2 else SNAPSHOT, message(1), 0))
+    assert (sent.outstanding, sent.copies) == (8, 4)
+    # 0 and 1 arrived, 2 and 3 were lost, 7 arrived.
+    sent.acknowledge(1, 0b11)
+    assert (sent.outstanding, sent.copies) == (6, 3)
+    sent.acknowledge(7, 0b1)
+    assert sent.copies == sum(packet is not None and packet.snapshot.copy for packet in sent._packets)
+    sent.declare_lost_before(1.0)
+    assert (sent.outstanding, sent.copies) == (0, 0)
+    sent.add(8, Packet(copy, message(1), 0))
+    sent.abandon_all()
+    assert (sent.outstanding, sent.copies) == (0, 0)
