@@ -54,11 +54,17 @@ def with_site(fleet: Fleet, place: BenchTarget, site: str) -> BenchTarget:
     return replace(place, site=site)
 
 
-def no_answer_hint(place: BenchTarget, node: Node | None, *, is_pinned: bool) -> str:
+def no_answer_hint(place: BenchTarget, node: Node | None, *, is_pinned: bool, is_unfinished: bool = False) -> str:
     """The probable reason why nothing answers at a place, and its remedy; empty at an address that the operator gave.
 
-    `node` is expected there; `is_pinned` if it has a host key, as since its first bootstrap.
+    `node` is expected there; `is_pinned` if it has a host key, as since its first bootstrap; `is_unfinished` if a run
+    left a change of it whose end is not known.
     """
+    if node is not None and is_unfinished:
+        return (
+            f"the last run left its change of {node.name} unconfirmed, so {node.name} undoes it and restarts its network: "
+            "try again in a few minutes"
+        )
     if node is not None and is_pinned:
         return (
             f"{node.name} has a pinned host key, so it is probably set up already and answers at {node.address.ip} "

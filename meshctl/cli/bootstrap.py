@@ -158,7 +158,12 @@ def _print_failure(outcome: Outcome, opened: Session, place: BenchTarget | None)
     hint = outcome.hint
     if not hint and outcome.result is Result.UNREACHABLE and place is not None:
         node = opened.fleet.nodes.get(place.node)
-        hint = no_answer_hint(place, node, is_pinned=node is not None and bool(opened.trust.pinned(node.name)))
+        hint = no_answer_hint(
+            place,
+            node,
+            is_pinned=node is not None and bool(opened.trust.pinned(node.name)),
+            is_unfinished=place.node in opened.journal.unfinished_changes(opened.fleet.name),
+        )
     if hint:
         echo(f"  hint: {hint}", err=True)
 

@@ -81,6 +81,9 @@ def test_silence_on_the_bench_names_its_probable_reason(tmp_path: Path) -> None:
         assert "n1 has a pinned host key, so it is probably set up already and answers at 10.42.0.1" in text
         assert "`meshctl status n1`" in text
         assert "--replace-key" in text
+        unfinished = no_answer_hint(place, node, is_pinned=True, is_unfinished=True)
+        assert unfinished.startswith("the last run left its change of n1 unconfirmed")
+        assert "reset it" not in unfinished
     assert "in the network of 192.168.1.1; if another device had this address" in no_answer_hint(
         BenchTarget(), None, is_pinned=False
     )
