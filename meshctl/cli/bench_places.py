@@ -62,8 +62,8 @@ def no_answer_hint(place: BenchTarget, node: Node | None, *, is_pinned: bool, is
     """
     if node is not None and is_unfinished:
         return (
-            f"the last run left its change of {node.name} unconfirmed, so {node.name} undoes it and restarts its network: "
-            "try again in a few minutes"
+            f"the last run left its change of {node.name} unconfirmed, so {node.name} undoes it and restarts its "
+            "network: try again in a few minutes"
         )
     if node is not None and is_pinned:
         return (

@@ -66,6 +66,9 @@ class Node:
         urgent_dscp: int = 46,
     ) -> None:
         check_items(links, LinkConfig, "links")
+        check_type(urgent_dscp, int, "urgent_dscp")
+        if not 0 <= urgent_dscp <= 63:
+            raise ValueError(f"urgent_dscp: expected 0 to 63, found {urgent_dscp}")
         _check_addresses(settings)
         self._settings = replace(settings, confirms=True)
         self._links = tuple(links)

@@ -67,7 +67,7 @@ async def run(configuration: Configuration) -> None:
             await metrics.close()
         await service.close()
         notifier.close()
-        log.info("stopped")
+    log.info("stopped")
 
 
 async def _serve(service: Service, notifier: Notifier) -> None:

@@ -1,6 +1,8 @@
 """The transport inside a program: two nodes on one loop, over real sockets."""
 
 import asyncio
+import os
+import resource
 from collections.abc import Callable, Coroutine
 from dataclasses import replace
 from pathlib import Path
@@ -184,6 +186,12 @@ def test_a_single_link_in_place_of_a_sequence_is_named() -> None:
         Node(Settings("alice", unkeyed=True), links=link)
 
 
+@pytest.mark.parametrize("dscp", [-5, 64, 300])
+def test_a_code_point_has_six_bits(dscp: int) -> None:
+    with pytest.raises(ValueError, match=f"urgent_dscp: expected 0 to 63, found {dscp}"):
+        Node(Settings("alice", unkeyed=True), urgent_dscp=dscp)
+
+
 def test_a_neighbor_needs_an_ip_address() -> None:
     """Nothing was ever sent to `localhost`, without a word."""
     neighbor = Neighbour(("localhost", 8700))
@@ -193,11 +201,17 @@ def test_a_neighbor_needs_an_ip_address() -> None:
 
 def test_a_node_that_cannot_start_leaves_no_socket_and_no_timer() -> None:
     async def main() -> None:
-        wrong: Any = "no number"
         link = LinkConfig(address="127.0.4.1", broadcast=False)
-        node = Node(Settings("alice", port=free_port(), unkeyed=True), links=(link,), urgent_dscp=wrong)
-        with pytest.raises(TypeError):
-            await node.__aenter__()
+        node = Node(Settings("alice", port=free_port(), unkeyed=True), links=(link,))
+        soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+        last = os.open(os.devnull, os.O_RDONLY)
+        os.close(last)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (last, hard))
+        try:
+            with pytest.raises(OSError, match="Too many open files"):
+                await node.__aenter__()
+        finally:
+            resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
         assert node.driver.closed
 
     asyncio.run(main())
