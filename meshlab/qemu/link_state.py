@@ -23,6 +23,9 @@ from meshlab.state import NodeState
 log = logging.getLogger("meshlab.qemu.link_state")
 # after a change could not be applied to a running node
 _RETRY_S = 1.0
+# Real radios raise their interrupts at different moments, hwsim's in the same one. Two radios on a switch would always
+# both claim a broadcast's sender for their LAN, and then leave it to each other: a claim takes less (docs/lab.md).
+_LAG_MS = 5.0
 
 
 class QemuLinkState(LinkState):
@@ -89,10 +92,16 @@ class QemuLinkState(LinkState):
             other = link.b if name == link.a else link.a
             # a TQ limit is implemented as the loss that leads to it
             loss = max(link.loss_to(name), loss_of(link.tq))
-            impairment = traffic_control.Impairment(loss, link.delay_ms, link.rate_kbps, link.broadcast_kbps)
+            delay_ms = link.delay_ms + self._lag_ms(name)
+            impairment = traffic_control.Impairment(loss, delay_ms, link.rate_kbps, link.broadcast_kbps)
             if not impairment.is_none:
                 heard.update({cell.mac: impairment for cell in self._fleet.nodes[other].effective.interfaces})
         self.impair(state, heard)
+
+    def _lag_ms(self, name: str) -> float:
+        """How much later this node hears than the first one on its LAN."""
+        lans = (lan for lan in self._fleet.spec.lans if name in lan.nodes)
+        return next((_LAG_MS * lan.nodes.index(name) for lan in lans), 0.0)
 
     def impair(self, state: NodeState, heard: dict[str, traffic_control.Impairment]) -> None:
         """Apply impairments, by the sender's MAC, on every radio interface of the node that is up."""

@@ -206,3 +206,18 @@ def test_a_link_has_the_configured_loss_and_goes_down_at_once(lab: Lab) -> None:
     lab.meshctl("lab", "mend", "base-b01")
     lab.settle()
     until(lambda: quality() > 230, "the link's full quality again")
+
+
+def test_two_radios_on_a_switch_agree_which_of_them_forwards_broadcasts(lab: Lab) -> None:
+    """On an idle machine, radios that hear a frame in the same moment never do (docs/lab.md)."""
+    mac = lab.computer("base-station", "cat /sys/class/net/eth0/address").strip()
+
+    def owner(name: str) -> str:
+        claims = map(str.split, lab.on(name, "batctl meshif bat0 claimtable -H").splitlines())
+        return next((by for client, _, _, _, by, *_ in claims if client == mac), "")
+
+    def is_agreed() -> bool:
+        lab.answers("base-station", lab.FAR_COMPUTER)
+        return owner("husky-front") == owner("husky-rear") != ""
+
+    until(is_agreed, "the radios to agree")
