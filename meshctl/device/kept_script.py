@@ -17,7 +17,7 @@ import paramiko
 from meshctl.device.connection import Completed
 from meshctl.device.errors import OutputTooLarge
 from meshctl.device.framing import framed, quoted
-from meshctl.device.ssh_channel import MAX_OUTPUT_BYTES
+from meshctl.device.ssh_channel import MAX_OUTPUT_BYTES, OPEN_ATTEMPTS, open_session
 
 _READ_BYTES = 32 << 10
 _END = re.compile(rb"(ended-[0-9a-f]{32}) (\d{1,3})\n\Z")
@@ -42,11 +42,23 @@ class KeptScript:
         self._label = label
 
     @classmethod
-    def start(cls, channel: paramiko.Channel, label: str, script: str) -> KeptScript:
-        """Send the script. Raises what paramiko raises."""
+    def start(cls, transport: paramiko.Transport, label: str, script: str) -> KeptScript:
+        """Open a channel and send the script. Raises what paramiko raises.
+
+        Some servers close a new channel (`open_session`), which may show only when the command is to start: the script
+        has not run then, and a shell is started again.
+        """
         sent = framed(_LOOP.format(script=script))
-        channel.exec_command(sent.command)
-        channel.sendall(sent.preamble)
+        for attempt in range(OPEN_ATTEMPTS):
+            channel = open_session(transport)
+            try:
+                channel.exec_command(sent.command)
+                channel.sendall(sent.preamble)
+            except (paramiko.SSHException, OSError):
+                if attempt == OPEN_ATTEMPTS - 1 or not transport.is_active():
+                    raise
+            else:
+                break
         return cls(channel, label)
 
     @property

@@ -317,7 +317,7 @@ class SshConnection(Connection):
         with keepalives(self._transport, self._limits.ask_s, self._limits.keepalive_s):
             if kept is None or not kept.is_open:
                 with self._waiting(min(seconds, self._limits.channel_s), "opening a channel"):
-                    kept = KeptScript.start(open_session(self._transport), self._endpoint.label, script)
+                    kept = KeptScript.start(self._transport, self._endpoint.label, script)
             try:
                 with self._waiting(seconds, "a command"):
                     done = kept.run(arguments)
