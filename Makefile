@@ -15,11 +15,11 @@ demo: setup
 
 # The tests start the programs hundreds of times, and each worker imports all tests: with PYTHONDONTWRITEBYTECODE each
 # would compile them.
-# Eight workers on two cores: tests of virtual fleets and of real radios wait for most of their time.
+# Six workers on two cores: tests of virtual fleets and of real radios wait for most of their time.
 test: setup
 	$(BIN)/python -m compileall -q meshctl meshlab mesh_sweep udp_mesh
 	scripts/with-test-directory env -u PYTHONDONTWRITEBYTECODE \
-		$(BIN)/pytest -n 8 --dist loadgroup --no-loadscope-reorder
+		$(BIN)/pytest -n 6 --dist loadgroup --no-loadscope-reorder
 
 check: setup
 	$(BIN)/ruff check .
