@@ -122,8 +122,8 @@ def measure(radios: int, robots: int, checkouts: Mapping[str, str]) -> list[dict
             label: [f"{checkout}/.venv/bin/meshctl", "status", "--json", "-i", str(devices.inventory)]
             for label, checkout in checkouts.items()
         }
-        devices.start()
         try:
+            devices.start()
             without_robots = {label: [*command, "--no-robots"] for label, command in commands.items()}
             alone = repeated(devices, without_robots, environ, radios)
             both = repeated(devices, commands, environ, radios + robots)
