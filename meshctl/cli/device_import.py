@@ -27,6 +27,7 @@ from meshctl.interchange.device_entries import ImportOptions, secret_path
 from meshctl.interchange.device_import import DeviceImport
 from meshctl.interchange.device_import import import_device as make_import
 from meshctl.interchange.new_inventory import edited, edits_of, load_text, new_text
+from meshctl.inventory.all_or_none import all_or_none
 from meshctl.inventory.edit import Editor, FileEdit, save
 from meshctl.inventory.load import load_fleet
 from meshctl.inventory.secrets import SecretStore
@@ -307,30 +308,14 @@ def _lint_errors(target: ImportTarget, made: DeviceImport) -> tuple[Diagnostic, 
 
 
 def _write(target: ImportTarget, text: str, edits: tuple[FileEdit, ...], files: Mapping[Path, Secret]) -> None:
-    """Write the secrets, then the inventory; a failure or Ctrl-C removes the secrets. Raises InputError."""
-    written: list[Path] = []
-    try:
+    """Write the secrets, then the inventory; a failure or Ctrl-C removes the new files. Raises InputError."""
+    with all_or_none(target.file) as new_files:
         for path, secret in files.items():
-            path.parent.mkdir(parents=True, exist_ok=True)
-            _create(path, secret.reveal() + "\n", 0o600)
-            written.append(path)
+            new_files.create(path, (secret.reveal() + "\n").encode(), mode=0o600)
         if target.new is not None:
-            target.file.parent.mkdir(parents=True, exist_ok=True)
-            _create(target.file, text, 0o666)
+            new_files.create(target.file, text.encode())
         else:
             save(edits)
-    except BaseException as error:
-        for path in written:
-            path.unlink(missing_ok=True)
-        if isinstance(error, OSError):
-            raise InputError(f"{error.filename or target.file} cannot be written: {error.strerror}") from error
-        raise
-
-
-def _create(path: Path, text: str, mode: int) -> None:
-    """Write a new file. Raises OSError if it exists."""
-    with open(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "w", encoding="utf-8") as stream:
-        stream.write(text)
 
 
 def _show(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from meshctl.errors import InputError
+from meshctl.inventory.all_or_none import all_or_none
 from meshctl.inventory.edit import Editor, save
 from meshctl.resources import shipped
 
@@ -19,22 +20,11 @@ def write_starter(directory: Path, ssh_key: str = "") -> tuple[Path, ...]:
     taken = [name for name in names if (directory / name).exists() or (directory / name).is_symlink()]
     if taken:
         raise InputError(f"{directory / taken[0]} already exists; not overwritten", hint="choose another directory")
-    created: list[Path] = []
-    try:
-        directory.mkdir(parents=True, exist_ok=True)
+    with all_or_none(directory) as new_files:
         for name in names:
-            with (directory / name).open("xb") as stream:
-                created.append(directory / name)
-                stream.write((source / name).read_bytes())
+            new_files.create(directory / name, (source / name).read_bytes())
         if ssh_key:
             editor = Editor.open(directory)
             editor.set(("operators", "ssh_keys"), [ssh_key])
             save(editor.changes())
-    except BaseException as reason:
-        # a part of a file would be an inventory with errors, which the next `init` does not overwrite
-        for path in created:
-            path.unlink(missing_ok=True)
-        if isinstance(reason, OSError):
-            raise InputError(f"{reason.filename or directory} cannot be written: {reason.strerror}") from reason
-        raise
-    return tuple(created)
+    return tuple(directory / name for name in names)

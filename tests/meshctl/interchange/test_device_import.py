@@ -19,6 +19,7 @@ from meshctl.interchange.device_differences import Fate, compare
 from meshctl.interchange.interfaces import bridge_ports
 from meshctl.interchange.new_inventory import load_text, new_text
 from meshctl.inventory import load_fleet
+from meshctl.inventory.all_or_none import NewFiles
 from meshctl.model import MASK, Encryption, Fleet, MeshMode, Release
 from meshctl.render import render_node
 from meshctl.render.compare import placeholder_secret
@@ -329,12 +330,15 @@ def test_a_line_break_in_the_boards_name_cannot_add_to_the_inventory(tmp_path: P
 
 
 def test_a_failed_write_leaves_no_key_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(path: Path, text: str, mode: int) -> None:
-        if path.name == "fleet.yaml":
-            raise KeyboardInterrupt
-        path.write_text(text)
+    create = NewFiles.create
 
-    monkeypatch.setattr("meshctl.cli.device_import._create", fail)
+    def fail(self: NewFiles, path: Path, content: bytes, *, mode: int = 0o666) -> None:
+        if path.name == "fleet.yaml":
+            create(self, path, content[:100], mode=mode)
+            raise KeyboardInterrupt
+        create(self, path, content, mode=mode)
+
+    monkeypatch.setattr(NewFiles, "create", fail)
     done = run("uci", str(EXPORTS / "foreign.uci"), "--new", str(tmp_path / "valley"), *BOARD)
     assert done.exit_code == 130
     assert [path for path in tmp_path.rglob("*") if path.is_file()] == []
