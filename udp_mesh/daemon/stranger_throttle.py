@@ -15,11 +15,13 @@ from udp_mesh.links.udp import UdpLink
 
 log = logging.getLogger(__name__)
 
-FLOOD_DATAGRAMS = 32
-"""Half as many unauthenticated datagrams in one wake-up are a flood; then at most so many are read at a time."""
+FLOOD_DATAGRAMS = 16
+"""So many unauthenticated datagrams in one wake-up are a flood."""
+FLOOD_BATCH = 12
+"""During a flood, at most so many are read at a time: an urgent message waits for up to a quarter of a millisecond."""
 PAUSE = 4.0
 """Time without reading after each batch, in multiples of what the batch took: a fifth of the time goes to a flood."""
-MIN_PAUSE_S, MAX_PAUSE_S = 0.002, 0.5
+MIN_PAUSE_S, MAX_PAUSE_S = 0.001, 0.5
 """A batch that took longer than the pauses allow was interrupted, for example because the process was suspended."""
 LOG_INTERVAL_S = 60.0
 
@@ -64,10 +66,11 @@ class StrangerThrottle:
 
     def _readable(self, link: UdpLink) -> None:
         name = link.attachment.name
+        limit, few = (FLOOD_BATCH, FLOOD_BATCH / 2) if name in self.flooded else (self._batch, FLOOD_DATAGRAMS)
         began, before = self._loop.time(), self._unauthenticated()
-        count = self._read(link, FLOOD_DATAGRAMS if name in self.flooded else self._batch)
+        count = self._read(link, limit)
         unauthenticated = self._unauthenticated() - before
-        if unauthenticated < FLOOD_DATAGRAMS / 2 or 2 * unauthenticated <= count:
+        if unauthenticated < few or 2 * unauthenticated <= count:
             self.flooded.discard(name)
             return
         self.flooded.add(name)

@@ -12,7 +12,7 @@ from tests.udp_mesh.links.sockets import WAIT_S, free_port
 from udp_mesh import Node
 from udp_mesh.core.events import MessageDelivered
 from udp_mesh.daemon.driver import MAX_DRAIN_DATAGRAMS
-from udp_mesh.daemon.stranger_throttle import FLOOD_DATAGRAMS
+from udp_mesh.daemon.stranger_throttle import FLOOD_BATCH
 from udp_mesh.links.udp import Deliver, UdpLink
 
 STRANGER = "127.0.4.66"
@@ -71,7 +71,7 @@ def test_a_flood_is_read_a_few_at_a_time_with_pauses_and_logged_once(
                     attacker.sendto(b"\x93" + bytes(100), link.attachment.address)
                 assert isinstance(await alice.deliver("status", b"urgent", to="bob"), MessageDelivered)
         assert limits[0] == MAX_DRAIN_DATAGRAMS
-        assert FLOOD_DATAGRAMS in limits
+        assert FLOOD_BATCH in limits
         assert not any(paused), "read during a pause"
         # Once the flood is over, strangers are read as before.
         while bob.driver.strangers.flooded:

@@ -10,7 +10,14 @@ import pytest
 
 from tests.udp_mesh.daemon.test_bulk_ticks import ManualLoop
 from tests.udp_mesh.links.sockets import free_port, open_link
-from udp_mesh.daemon.stranger_throttle import FLOOD_DATAGRAMS, MAX_PAUSE_S, MIN_PAUSE_S, PAUSE, StrangerThrottle
+from udp_mesh.daemon.stranger_throttle import (
+    FLOOD_BATCH,
+    FLOOD_DATAGRAMS,
+    MAX_PAUSE_S,
+    MIN_PAUSE_S,
+    PAUSE,
+    StrangerThrottle,
+)
 from udp_mesh.links.udp import UdpLink
 
 BATCH = 256
@@ -58,11 +65,11 @@ def test_a_flood_is_read_in_small_batches_for_a_fifth_of_the_time() -> None:
             strangers.wake()
             assert strangers.throttle.paused
             assert strangers.end_pause() == pytest.approx(max(MIN_PAUSE_S, PAUSE * READ_S))
-        assert strangers.limits == [BATCH, FLOOD_DATAGRAMS, FLOOD_DATAGRAMS]
+        assert strangers.limits == [BATCH, FLOOD_BATCH, FLOOD_BATCH]
         strangers.forged = 0.0
         strangers.wake()
         strangers.wake()
-        assert strangers.limits[3:] == [FLOOD_DATAGRAMS, BATCH]
+        assert strangers.limits[3:] == [FLOOD_BATCH, BATCH]
 
 
 def test_after_a_process_was_suspended_strangers_are_heard_soon() -> None:
@@ -74,7 +81,7 @@ def test_after_a_process_was_suspended_strangers_are_heard_soon() -> None:
         assert strangers.end_pause() == pytest.approx(MAX_PAUSE_S)
 
 
-@pytest.mark.parametrize(("waiting", "forged"), [(FLOOD_DATAGRAMS // 2 - 1, 1.0), (1000, 0.5)])
+@pytest.mark.parametrize(("waiting", "forged"), [(FLOOD_DATAGRAMS - 1, 1.0), (1000, 0.5)])
 def test_few_forged_datagrams_or_as_many_authentic_ones_are_no_flood(waiting: int, forged: float) -> None:
     with closing(open_link("127.0.1.4", free_port())) as link:
         strangers = Strangers(link)
