@@ -18,7 +18,7 @@ log = logging.getLogger(__name__)
 FLOOD_DATAGRAMS = 16
 """So many unauthenticated datagrams in one wake-up are a flood."""
 FLOOD_BATCH = 12
-"""During a flood, at most so many are read at a time: an urgent message waits for up to a quarter of a millisecond."""
+"""During a flood, at most so many are read at a time: an urgent message waits for one such batch at most."""
 PAUSE = 4.0
 """Time without reading after each batch, in multiples of what the batch took: a fifth of the time goes to a flood."""
 MIN_PAUSE_S, MAX_PAUSE_S = 0.001, 0.5
