@@ -102,9 +102,10 @@ class NatsWorker:
         threads = [
             threading.Thread(target=self._repeat, args=(loop,), name=loop.__name__, daemon=True) for loop in loops
         ]
+        # first: what the threads report belongs after it
+        _log(f"serving {self.directory.fleet}/{self.directory.site}")
         for thread in threads:
             thread.start()
-        _log(f"serving {self.directory.fleet}/{self.directory.site}")
         while not (reason := self.client.closed_by):
             time.sleep(_RETRY_S)
         raise NatsLost(f"the leaf node closed the connection: {reason}")
