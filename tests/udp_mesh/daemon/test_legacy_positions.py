@@ -101,7 +101,9 @@ def test_a_restarted_daemon_frees_the_slots_of_a_legacy_sender(how: signal.Signa
             tell(encode_legacy(Host("old", "127.0.3.9")))
             wait_online(daemon, "old")
             tell(encode_legacy(fragments(500, b"x")[0]))
-            poll(lambda: saved.exists() and json.loads(saved.read_text())["old"][0] == 500, "the position is saved")
+            # the file is there, and empty, before it is written
+            poll(lambda: saved.exists() and load_positions(saved).keys() == {"old"}, "the position is saved")
+            assert json.loads(saved.read_text())["old"][0] == 500
             daemon.signal(how)
             assert daemon.process is not None
             daemon.process.wait()
