@@ -19,8 +19,9 @@ REORDER_PACKETS = 3
 MAX_REORDER_PACKETS = 64
 """Upper bound of the learned reordering threshold."""
 
-MAX_REMEMBERED_LOST = 256
-"""Lost packets that a later acknowledgment may correct: those its bitmap covers."""
+REMEMBERED_NUMBERS = 2048
+"""A later acknowledgment corrects the loss of the last so many packets. At 90 Mbit/s so many are sent into an outage
+until the peer counts as unresponsive, and what a radio's queue kept of them arrives after it."""
 
 
 class SendSnapshot(NamedTuple):
@@ -81,6 +82,7 @@ class SentPackets:
         self.outstanding = self.copies = 0
         self.reorder_packets = REORDER_PACKETS
         self._lost: OrderedDict[int, tuple[Packet, bool]] = OrderedDict()
+        """By number, in the order of the numbers, and whether later packets overtook it."""
         self._timed_out: list[int] = []
         """Numbers of urgent packets declared lost by age and not yet covered by an acknowledgment."""
         self.spurious = 0
@@ -244,12 +246,17 @@ class SentPackets:
 
     def _remember(self, number: int, packet: Packet, *, overtaken: bool) -> None:
         self._lost[number] = (packet, overtaken)
-        if len(self._lost) > MAX_REMEMBERED_LOST:
+        while next(iter(self._lost)) <= number - REMEMBERED_NUMBERS:
             self._lost.popitem(last=False)
 
     def _undo_loss(self, largest: int, received: int, acknowledged: list[Packet]) -> None:
-        late = [number for number in self._lost if number <= largest and received >> (largest - number) & 1]
-        for number in late:
+        late = []
+        for number in reversed(self._lost):
+            if largest - number >= received.bit_length():
+                break
+            if number <= largest and received >> (largest - number) & 1:
+                late.append(number)
+        for number in reversed(late):
             packet, overtaken = self._lost.pop(number)
             acknowledged.append(packet)
             self.spurious += 1

@@ -4,7 +4,13 @@ from __future__ import annotations
 
 from udp_mesh.core.events import MessageId
 from udp_mesh.core.sender.message import AcceptedMessage, OutgoingMessage, TopicChannel
-from udp_mesh.core.sender.sent_packets import REORDER_PACKETS, Packet, SendSnapshot, SentPackets
+from udp_mesh.core.sender.sent_packets import (
+    REMEMBERED_NUMBERS,
+    REORDER_PACKETS,
+    Packet,
+    SendSnapshot,
+    SentPackets,
+)
 from udp_mesh.core.settings import Topic
 
 SNAPSHOT = SendSnapshot(0.0, 0, 0.0, 0.0, app_limited=False)
@@ -83,6 +89,23 @@ def test_an_outage_proves_no_loss() -> None:
     sent.add(2, Packet(SNAPSHOT, message(1), 0))
     sent.abandon_all()
     assert sent.confirm_timed_out(9, 0) == 0
+
+
+def test_what_a_radios_queue_kept_during_an_outage_is_acknowledged_after_it() -> None:
+    """The queue keeps the first packets of an outage, and many more were sent behind them."""
+    sent = in_flight(1000)
+    sent.declare_lost_before(0.0)
+    acknowledged, _, late = sent.acknowledge(9, (1 << 10) - 1)
+    assert (len(acknowledged), late is not None) == (10, True)
+    acknowledged, _, _ = sent.acknowledge(20, 0b101)
+    assert len(acknowledged) == 2
+
+
+def test_lost_packets_are_forgotten_when_no_acknowledgment_can_come_anymore() -> None:
+    sent = in_flight(3 * REMEMBERED_NUMBERS)
+    sent.declare_lost_before(0.0)
+    assert sent.acknowledge(9, 1) == ([], [], None)
+    assert len(sent.acknowledge(3 * REMEMBERED_NUMBERS - 1, 1)[0]) == 1
 
 
 def test_an_urgent_packet_that_overtakes_a_whole_run_of_others_shows_no_loss() -> None:
