@@ -68,6 +68,10 @@ class RttEstimator:
         self._min_samples: deque[tuple[float, float]] = deque()
         self._windowed_samples: deque[tuple[float, float]] = deque()
 
+    def restart_smoothed(self) -> None:
+        """The next sample is the first of the smoothed RTT and its variation; minimum and window stay."""
+        self.smoothed_rtt = None
+
     def sample(self, round_trip_s: float, now: float) -> None:
         """Add a measured round trip, without the time the peer held its acknowledgment back."""
         round_trip_s = min(round_trip_s, max(MAX_RTT_OUTLIER_S, 2 * (self.smoothed_rtt or 0.0)))

@@ -48,6 +48,11 @@ EXPIRE_INTERVAL_S = 0.005
 NON_URGENT_RTT_VALID_S = 1.0
 """While a round trip sample of a packet that is not urgent is younger than this, urgent ones do not count."""
 
+OUTAGE_S = 0.1
+OUTAGE_ROUND_TRIPS = 3.0
+"""No acknowledgement for longer than both is an outage: more than a radio's repetitions of a frame take, or a longer
+route."""
+
 STALE_AFTER_S = 1.0
 """After an outage, messages that are not urgent and have waited longer than this share their level with new ones."""
 
@@ -62,6 +67,8 @@ class Sender(PendingMessages):
         self.urgent_rtt = RttEstimator()
         """Of urgent packets only: in a radio's queues they overtake others (Wi-Fi access categories)."""
         self._non_urgent_sampled_at = float("-inf")
+        self._outage_ended_at = float("-inf")
+        """Until the round trip of a packet sent after the last outage is known: when that ended."""
         self.congestion: CongestionController = DelayBasedController(self.rtt)
         self.pacer = Pacer(settings.rates.pace_quantum_s)
         self.in_flight = SentPackets()
@@ -138,6 +145,8 @@ class Sender(PendingMessages):
         if acknowledged:
             # Packets acknowledged late and all at once say nothing about the rate of the link.
             after_silence = self.state is not SendState.ACTIVE
+            if now - self.last_progress > max(OUTAGE_S, OUTAGE_ROUND_TRIPS * (self.rtt.smoothed_rtt or float("inf"))):
+                self._outage_ended_at = now
             self.last_progress = now
             if not all(packet.snapshot.urgent for packet in acknowledged):
                 self.non_urgent_progress = now
@@ -156,7 +165,7 @@ class Sender(PendingMessages):
             self.delivered_packets += count
             if newest is not None:
                 snapshot = newest.snapshot
-                if self._sample(max(1e-5, now - snapshot.sent_at - ack.delay_us * 1e-6), now, urgent=snapshot.urgent):
+                if self._sample(snapshot, ack.delay_us * 1e-6, now):
                     largest = ack.largest
                 elapsed = max(now - snapshot.delivered_at, snapshot.sent_at - snapshot.delivered_sent_at)
                 if elapsed > 0 and not after_silence:
@@ -187,16 +196,22 @@ class Sender(PendingMessages):
         lost_packets = len(lost) + timed_out
         self.loss.add(lost_packets, len(acknowledged) + lost_packets, self.rates.twice_loss)
 
-    def _sample(self, round_trip_s: float, now: float, *, urgent: bool) -> bool:
+    def _sample(self, snapshot: SendSnapshot, ack_delay_s: float, now: float) -> bool:
         """Add a round trip sample. True if it counts for the congestion window."""
-        if urgent:
+        round_trip_s = max(1e-5, now - snapshot.sent_at - ack_delay_s)
+        if snapshot.urgent:
             self.urgent_rtt.sample(round_trip_s, now)
             if now < self._non_urgent_sampled_at + NON_URGENT_RTT_VALID_S:
                 return False
         else:
             self._non_urgent_sampled_at = now
+        # Round trips of packets sent before the end of an outage show how long it was, not how long the path is.
+        is_of_path = snapshot.sent_at >= self._outage_ended_at
+        if is_of_path and self._outage_ended_at != float("-inf"):
+            self._outage_ended_at = float("-inf")
+            self.rtt.restart_smoothed()
         self.rtt.sample(round_trip_s, now)
-        return True
+        return is_of_path
 
     def _record_arrivals(self, packets: Iterable[Packet]) -> None:
         for packet in packets:

@@ -37,3 +37,14 @@ def test_a_persistent_queue_is_detected_despite_jitter() -> None:
 
 def test_packet_serialization_time_is_not_counted_as_jitter() -> None:
     assert stalled(estimator(50, packet_s=0.02), MIN_WINDOWED_RTT_S + 0.003) > BASE_S + 0.02
+
+
+def test_a_restarted_smoothed_round_trip_is_that_of_the_next_sample() -> None:
+    rtt = estimator(0)
+    for number in range(20):
+        rtt.sample(0.4, 10.0 + number * 0.001)
+    assert rtt.smoothed_rtt is not None
+    assert rtt.smoothed_rtt > 0.3
+    rtt.restart_smoothed()
+    rtt.sample(BASE_S, 10.1)
+    assert (rtt.smoothed_rtt, rtt.rttvar, rtt.windowed_rtt) == (BASE_S, BASE_S / 2, BASE_S)

@@ -8,6 +8,7 @@ from tests.udp_mesh.core.test_links import Run
 from udp_mesh.core.events import MessageId
 from udp_mesh.core.sender.message import AcceptedMessage, OutgoingMessage, TopicChannel
 from udp_mesh.core.sender.redundancy import EARLY_COPIES, MAX_OVERDUE_COPIES, RedundantCopies
+from udp_mesh.core.sender.sent_packets import SendSnapshot
 from udp_mesh.core.settings import Topic
 
 GAP_S, OVERDUE_S = 0.003, 0.030
@@ -80,9 +81,13 @@ def test_urgent_packets_are_not_used_as_rtt_samples_while_bulk_is_sent() -> None
     run.start()
     run.world.run(3.0)
     sender = run.world.nodes["a"]._state.peer_table.peers["b"].open_sender()
-    smoothed = sender.rtt.smoothed_rtt
-    assert not sender._sample(0.001, run.world.now, urgent=True)
+    smoothed, now = sender.rtt.smoothed_rtt, run.world.now
+    assert not sender._sample(sent(now - 0.001, urgent=True), 0.0, now)
     assert sender.rtt.smoothed_rtt == smoothed
-    assert sender._sample(0.030, run.world.now, urgent=False)
+    assert sender._sample(sent(now - 0.030, urgent=False), 0.0, now)
     # With no other traffic, urgent packets are all there is to measure.
-    assert sender._sample(0.001, run.world.now + 10.0, urgent=True)
+    assert sender._sample(sent(now + 9.999, urgent=True), 0.0, now + 10.0)
+
+
+def sent(at: float, *, urgent: bool) -> SendSnapshot:
+    return SendSnapshot(at, 0, 0.0, 0.0, app_limited=False, urgent=urgent)
