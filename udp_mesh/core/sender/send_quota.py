@@ -25,8 +25,9 @@ MIN_LOSS_FACTOR = 0.5
 LOSS_WEIGHT = 5.0
 """Acknowledgments are lost too: each percent of loss requests them 5 % more often, up to twice as often."""
 
-LATE_AFTER_S = 0.006
-"""Acknowledgments are late when overdue by more than their spacing, and by at least this long."""
+LATE_AFTER_S = 0.004
+"""Acknowledgments are late when overdue by more than their spacing, and by at least this long: little more than the
+queue at the bottleneck lasts."""
 
 MAX_URGENT_WAIT_S = 0.1
 """Maximum wait of an urgent fragment for packets in flight, which may be in a queue of seconds or lost unnoticed. One

@@ -18,11 +18,11 @@ BOUNDS = {
     "20 to 60 ms": (1, 0.84, 55),
     "half duplex": (1, 0.87, 15),
     "600 ms, 2 %": (2, 0.92, 380),
-    "wifi rate walk": (1, 0.84, 52),
+    "wifi rate walk": (1, 0.88, 48),
     "route 10 and 150 ms, MTU hole": (1, 0.81, 125),
-    "four senders": (1, 0.915, 21),
+    "four senders": (1, 0.92, 21),
     "1 Mbit/s, 5 %": (1, 0.82, 60),
-    "three half-duplex hops": (1, 0.80, 42),
+    "three half-duplex hops": (1, 0.80, 46),
 }
 FAIR = {"beside cubic": (1, 0.35, 0.65), "beside BBR": (1, 0.35, 0.65)}
 """name: (seed, least and largest share)."""
