@@ -42,7 +42,7 @@ class Interrupt:
             self._leave.set()
             # how to go on depends on the command: its last line says so
             self._report(
-                "leaving: nodes with an armed change roll it back (Ctrl-C again to exit without closing connections)"
+                "leaving: nodes roll back what is not confirmed (Ctrl-C again to exit without closing connections)"
             )
         else:
             self._stop.set()
