@@ -41,8 +41,8 @@ COMMAND_S = 900.0
 TRIES = 3
 # six emulated nodes that boot together took up to 200 s on two cores beside twenty other programs
 WAIT_S = 600.0
-# An emulated machine works through most of its time, and takes a quarter of a processor for as long as it runs: what
-# waits for it is over sooner, and the whole run, too. Three times the share of another process
+# An emulated machine is busy most of the time, and takes a quarter of a processor when idle: with three times the share
+# of another process its tests, and the whole run, end sooner
 MACHINE_NICE = -5
 NODES = ("base", "b01", "b02", "husky-front", "husky-rear")
 
