@@ -250,9 +250,10 @@ class SentPackets:
             self._lost.popitem(last=False)
 
     def _undo_loss(self, largest: int, received: int, acknowledged: list[Packet]) -> None:
+        oldest = largest - received.bit_length() + 1
         late = []
         for number in reversed(self._lost):
-            if largest - number >= received.bit_length():
+            if number < oldest:
                 break
             if number <= largest and received >> (largest - number) & 1:
                 late.append(number)
