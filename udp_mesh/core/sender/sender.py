@@ -15,7 +15,7 @@ from collections.abc import Iterable
 from udp_mesh.core.congestion.controller import CongestionController, FixedWindow
 from udp_mesh.core.congestion.delay_based import DelayBasedController
 from udp_mesh.core.congestion.pacer import Pacer
-from udp_mesh.core.congestion.rtt import INITIAL_PTO_S, RttEstimator
+from udp_mesh.core.congestion.rtt import INITIAL_PTO_S
 from udp_mesh.core.events import ExpiryReason
 from udp_mesh.core.sender.loss_estimate import LossEstimate
 from udp_mesh.core.sender.message import OutgoingMessage
@@ -24,6 +24,7 @@ from udp_mesh.core.sender.pending import PendingMessages
 from udp_mesh.core.sender.pmtu import PathMtu
 from udp_mesh.core.sender.probing import PROBE_INTERVAL_S, Probing
 from udp_mesh.core.sender.redundancy import OVERDUE_ROUND_TRIPS, RedundantCopies
+from udp_mesh.core.sender.round_trips import RoundTrips
 from udp_mesh.core.sender.scheduler import Scheduler
 from udp_mesh.core.sender.send_memory import SendMemory
 from udp_mesh.core.sender.send_state import TRANSITIONS, SendEvent, SendState
@@ -45,14 +46,6 @@ MAX_ACK_WAIT_S = 1.0
 EXPIRE_INTERVAL_S = 0.005
 """Between two checks for timed-out packets."""
 
-NON_URGENT_RTT_VALID_S = 1.0
-"""While a round trip sample of a packet that is not urgent is younger than this, urgent ones do not count."""
-
-OUTAGE_S = 0.1
-OUTAGE_ROUND_TRIPS = 3.0
-"""No acknowledgement for longer than both is an outage: more than a radio's repetitions of a frame take, or a longer
-route."""
-
 STALE_AFTER_S = 1.0
 """After an outage, messages that are not urgent and have waited longer than this share their level with new ones."""
 
@@ -63,12 +56,8 @@ class Sender(PendingMessages):
 
     def __init__(self, settings: Settings, memory: SendMemory | None = None, peer: str = "") -> None:
         super().__init__(memory or SendMemory(settings.limits.queue_bytes), peer)
-        self.rtt = RttEstimator()
-        self.urgent_rtt = RttEstimator()
-        """Of urgent packets only: in a radio's queues they overtake others (Wi-Fi access categories)."""
-        self._non_urgent_sampled_at = float("-inf")
-        self._outage_ended_at = float("-inf")
-        """Until the round trip of a packet sent after the last outage is known: when that ended."""
+        self.round_trips = RoundTrips()
+        self.rtt = self.round_trips.path
         self.congestion: CongestionController = DelayBasedController(self.rtt)
         self.pacer = Pacer(settings.rates.pace_quantum_s)
         self.in_flight = SentPackets()
@@ -145,8 +134,7 @@ class Sender(PendingMessages):
         if acknowledged:
             # Packets acknowledged late and all at once say nothing about the rate of the link.
             after_silence = self.state is not SendState.ACTIVE
-            if now - self.last_progress > max(OUTAGE_S, OUTAGE_ROUND_TRIPS * (self.rtt.smoothed_rtt or float("inf"))):
-                self._outage_ended_at = now
+            self.round_trips.on_acknowledged(self.last_progress, now)
             self.last_progress = now
             if not all(packet.snapshot.urgent for packet in acknowledged):
                 self.non_urgent_progress = now
@@ -165,7 +153,7 @@ class Sender(PendingMessages):
             self.delivered_packets += count
             if newest is not None:
                 snapshot = newest.snapshot
-                if self._sample(snapshot, ack.delay_us * 1e-6, now):
+                if self.round_trips.sample(snapshot, ack.delay_us * 1e-6, now):
                     largest = ack.largest
                 elapsed = max(now - snapshot.delivered_at, snapshot.sent_at - snapshot.delivered_sent_at)
                 if elapsed > 0 and not after_silence:
@@ -195,23 +183,6 @@ class Sender(PendingMessages):
             self._requeue(lost)
         lost_packets = len(lost) + timed_out
         self.loss.add(lost_packets, len(acknowledged) + lost_packets, self.rates.twice_loss)
-
-    def _sample(self, snapshot: SendSnapshot, ack_delay_s: float, now: float) -> bool:
-        """Add a round trip sample. True if it counts for the congestion window."""
-        round_trip_s = max(1e-5, now - snapshot.sent_at - ack_delay_s)
-        if snapshot.urgent:
-            self.urgent_rtt.sample(round_trip_s, now)
-            if now < self._non_urgent_sampled_at + NON_URGENT_RTT_VALID_S:
-                return False
-        else:
-            self._non_urgent_sampled_at = now
-        # Round trips of packets sent before the end of an outage show how long it was, not how long the path is.
-        is_of_path = snapshot.sent_at >= self._outage_ended_at
-        if is_of_path and self._outage_ended_at != float("-inf"):
-            self._outage_ended_at = float("-inf")
-            self.rtt.restart_smoothed()
-        self.rtt.sample(round_trip_s, now)
-        return is_of_path
 
     def _record_arrivals(self, packets: Iterable[Packet]) -> None:
         for packet in packets:
@@ -265,7 +236,7 @@ class Sender(PendingMessages):
 
     def urgent_timeout_s(self) -> float:
         """Time after which the acknowledgement of an urgent fragment is overdue."""
-        smoothed_rtt = self.urgent_rtt.smoothed_rtt or self.rtt.smoothed_rtt
+        smoothed_rtt = self.round_trips.urgent.smoothed_rtt or self.rtt.smoothed_rtt
         return INITIAL_PTO_S if smoothed_rtt is None else OVERDUE_ROUND_TRIPS * smoothed_rtt + self.rates.twice_gap_s
 
     # Unresponsive peer

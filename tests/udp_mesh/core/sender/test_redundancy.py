@@ -82,11 +82,11 @@ def test_urgent_packets_are_not_used_as_rtt_samples_while_bulk_is_sent() -> None
     run.world.run(3.0)
     sender = run.world.nodes["a"]._state.peer_table.peers["b"].open_sender()
     smoothed, now = sender.rtt.smoothed_rtt, run.world.now
-    assert not sender._sample(sent(now - 0.001, urgent=True), 0.0, now)
+    assert not sender.round_trips.sample(sent(now - 0.001, urgent=True), 0.0, now)
     assert sender.rtt.smoothed_rtt == smoothed
-    assert sender._sample(sent(now - 0.030, urgent=False), 0.0, now)
+    assert sender.round_trips.sample(sent(now - 0.030, urgent=False), 0.0, now)
     # With no other traffic, urgent packets are all there is to measure.
-    assert sender._sample(sent(now + 9.999, urgent=True), 0.0, now + 10.0)
+    assert sender.round_trips.sample(sent(now + 9.999, urgent=True), 0.0, now + 10.0)
 
 
 def sent(at: float, *, urgent: bool) -> SendSnapshot:
