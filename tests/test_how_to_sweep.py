@@ -21,13 +21,16 @@ SRUN = """\
 # as `srun` in a job of two tasks
 "$@" & "$@" & wait
 """
+# a worker that starts slowly must not find the sweep done, and the scheduler gone
+BOTH_JOINED = "from distributed import Client; Client(scheduler_file='sweep.json').wait_for_workers(2, timeout=200)"
 
 
 def test_the_job_script_of_the_guide_runs_with_two_workers(tmp_path: Path) -> None:
     (script,) = re.findall(r"^```bash\n(.*?)^```", GUIDE.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
     text, count = re.subn(r"final-run .* --dask", "partition-soak --seeds 2 --set duration_s=5 --dask", script)
     assert count == 1
-    text = re.sub(r"dask (scheduler|worker)", r"dask \1 --host 127.0.0.1", text)
+    text = re.sub(r"dask (scheduler|worker)", r"dask \1 --host 127.0.0.1", text.rstrip())
+    text += f' && python -c "{BOTH_JOINED}"'
     (tmp_path / "venv").symlink_to(Path(sys.executable).parents[1])
     (tmp_path / "bin").mkdir()
     srun = tmp_path / "bin/srun"
