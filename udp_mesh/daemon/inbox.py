@@ -8,12 +8,16 @@
 
 A message that the disk does not take is confirmed when a program took it; without one, its sender sends it again later.
 An item of a log is on disk already, in the log: it is only noted here, and read again when a program subscribes.
+
+A robot whose program starts hours late holds a hundred thousand messages: what happens for each message, or at each
+visit of a client, must not go through all of them.
 """
 
 from __future__ import annotations
 
 import asyncio
 import logging
+from collections import Counter, deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
@@ -60,6 +64,15 @@ class Inbox:
         self._confirm = confirm
         self._request_again = request_again
         self._held: dict[int, _Held] = {}
+        """By key, oldest first."""
+        self._topics: Counter[str] = Counter()
+        """How many messages of each topic are held."""
+        self._unflushed: list[int] = []
+        """Those added since the last `flush` began."""
+        self._sent: dict[Client, set[int]] = {}
+        """Those sent to each program."""
+        self._unread: dict[Client, deque[tuple[int, int]]] = {}
+        """Those that a program has not read yet: (position in its stream, key), in the order sent."""
         self._next_key = 0
 
     def __len__(self) -> int:
@@ -71,8 +84,8 @@ class Inbox:
 
     def load(self) -> None:
         """Hold what the last run left on disk."""
-        for message in self._store.load():
-            self._held[message.key] = _Held(message.topic, None, on_disk=True)
+        for message in self._store.read_all():
+            self._hold(message.key, _Held(message.topic, None, on_disk=True))
             self._next_key = message.key + 1
 
     def add(self, message: MessageReceived) -> int:
@@ -80,16 +93,26 @@ class Inbox:
         key = self._next_key
         self._next_key += 1
         if message.number is not None:
-            self._held[key] = _Held(
-                message.topic,
-                message.receipt,
-                on_disk=False,
-                item=(message.source, message.topic, message.number),
-            )
+            item = (message.source, message.topic, message.number)
+            self._hold(key, _Held(message.topic, message.receipt, on_disk=False, item=item))
             return key
         stored = StoredMessage(key, message.source, message.topic, message.type_name, message.payload, None)
-        self._held[key] = _Held(message.topic, message.receipt, on_disk=self._store.put(stored))
+        self._hold(key, _Held(message.topic, message.receipt, on_disk=self._store.put(stored)))
+        self._unflushed.append(key)
         return key
+
+    def _hold(self, key: int, held: _Held) -> None:
+        self._held[key] = held
+        self._topics[held.topic] += 1
+
+    def _release(self, key: int) -> _Held:
+        held = self._held.pop(key)
+        self._topics[held.topic] -= 1
+        if not self._topics[held.topic]:
+            del self._topics[held.topic]
+        for client in held.reading:
+            self._sent[client].discard(key)
+        return held
 
     def on_distributed(self, key: int) -> None:
         """The message was sent to all programs subscribed now."""
@@ -100,7 +123,7 @@ class Inbox:
 
     async def flush(self) -> None:
         """Wait until everything added so far is on disk, then confirm it."""
-        waiting = [key for key, held in self._held.items() if held.receipt is not None and held.item is None]
+        waiting, self._unflushed = self._unflushed, []
         await self._flusher.flush()
         for key in waiting:
             held = self._held.get(key)
@@ -114,7 +137,7 @@ class Inbox:
                 self._drop(key, held)
 
     def _drop(self, key: int, held: _Held) -> None:
-        del self._held[key]
+        self._release(key)
         if held.receipt is not None:
             asyncio.get_running_loop().call_later(RETRY_S, self._request_again, held.receipt)
 
@@ -123,12 +146,17 @@ class Inbox:
     def on_sent(self, key: int, client: Client, *, acknowledges: bool) -> None:
         """The message was written to a client's connection."""
         held = self._held.get(key)
-        if held is not None:
-            held.reading[client] = None if acknowledges else client.written_bytes
+        if held is None:
+            return
+        held.reading[client] = None if acknowledges else client.written_bytes
+        self._sent.setdefault(client, set()).add(key)
+        if not acknowledges:
+            self._unread.setdefault(client, deque()).append((client.written_bytes, key))
 
     def waiting(self, matches: Callable[[str], bool]) -> list[int]:
         """The messages of these topics that no program is reading, oldest first."""
-        return sorted(key for key, held in self._held.items() if not held.reading and matches(held.topic))
+        topics = {topic for topic in self._topics if matches(topic)}
+        return [key for key, held in self._held.items() if not held.reading and held.topic in topics]
 
     def is_waiting(self, key: int) -> bool:
         """Whether no program is reading the message."""
@@ -147,7 +175,7 @@ class Inbox:
 
     def request_item(self, key: int) -> None:
         """Have an item of a log read and delivered again, as a message of its own."""
-        held = self._held.pop(key)
+        held = self._release(key)
         if held.receipt is not None:
             self._request_again(held.receipt)
 
@@ -164,17 +192,28 @@ class Inbox:
         return True
 
     def take_read(self) -> None:
-        """Remove what programs have read. A message waits for its acknowledgment if one of its readers is to give
-        it."""
-        for key, held in list(self._held.items()):
-            positions = list(held.reading.items())
-            if any(position is None for _, position in positions):
-                continue
-            if any(position is not None and client.read_bytes >= position for client, position in positions):
-                self._take(key, held)
+        """Remove what programs have read."""
+        for client, unread in list(self._unread.items()):
+            read_bytes = client.read_bytes
+            while unread and unread[0][0] <= read_bytes:
+                _, key = unread.popleft()
+                if (held := self._held.get(key)) is not None:
+                    self._take_if_read(key, held)
+            if not unread:
+                del self._unread[client]
+
+    def _take_if_read(self, key: int, held: _Held) -> None:
+        """A message waits for its acknowledgment if one of its readers is to give it."""
+        is_read = False
+        for client, position in held.reading.items():
+            if position is None:
+                return
+            is_read = is_read or client.read_bytes >= position
+        if is_read:
+            self._take(key, held)
 
     def _take(self, key: int, held: _Held) -> None:
-        del self._held[key]
+        self._release(key)
         if held.receipt is not None:
             self._confirm(held.receipt)
         if held.item is None:
@@ -183,12 +222,18 @@ class Inbox:
     def client_gone(self, client: Client) -> None:
         """Messages that the client has not taken go to another one."""
         self.take_read()
-        for key, held in list(self._held.items()):
-            if held.reading.pop(client, 0) != 0 and not held.reading and not held.on_disk and held.item is None:
+        self._unread.pop(client, None)
+        for key in sorted(self._sent.pop(client, ())):
+            held = self._held[key]
+            del held.reading[client]
+            if held.reading:
+                # others may have read it, and waited for this one's acknowledgment
+                self._take_if_read(key, held)
+            elif not held.on_disk and held.item is None:
                 self._drop(key, held)
 
     def topics(self) -> Iterator[str]:
-        return iter({held.topic for held in self._held.values()})
+        return iter(self._topics)
 
     def close(self) -> None:
         """Waits until everything added is written."""

@@ -20,6 +20,7 @@ import tempfile
 import threading
 import time
 import zlib
+from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
@@ -192,7 +193,10 @@ class DirectoryStore:
             return key in self._sizes
 
     def load(self) -> list[StoredMessage]:
-        messages: list[StoredMessage] = []
+        return list(self.read_all())
+
+    def read_all(self) -> Iterator[StoredMessage]:
+        """What `load` returns, one by one: the payloads of all may be more than the memory. Read it to its end."""
         for path in sorted(self._directory.glob(f"*{SUFFIX}")):
             message = _read(path)
             if message is None or self._path(message.key) != path:
@@ -204,11 +208,10 @@ class DirectoryStore:
             size = path.stat().st_size
             self._sizes[message.key] = size
             self.bytes += size
-            messages.append(message)
+            yield message
         for leftover in self._directory.glob("*.new"):
             with contextlib.suppress(OSError):
                 leftover.unlink()
-        return messages
 
     def read(self, key: int) -> StoredMessage | None:
         """One message from the disk; None if it is not there or damaged. Blocks."""

@@ -179,9 +179,14 @@ class Subscriptions:
         try:
             expired_at = loop.time() - READ_TIMEOUT_S
             self._reads = {item: at for item, at in self._reads.items() if at > expired_at}
+            # What follows on such a topic waits as well: its order is kept, and each is not asked for in vain.
+            without_taker: set[str] = set()
             for key in self._inbox.waiting(self._has_taker):
                 topic = self._inbox.topic(key)
-                if topic is None or not self._has_taker(topic):
+                if topic is None or topic in without_taker:
+                    continue
+                if not self._has_taker(topic):
+                    without_taker.add(topic)
                     continue
                 if (item := self._inbox.item(key)) is not None:
                     if len(self._reads) < MAX_READS:
