@@ -15,7 +15,6 @@ from __future__ import annotations
 import asyncio
 import os
 import random
-from collections import deque
 from collections.abc import AsyncIterator, Sequence
 from dataclasses import replace
 from ipaddress import ip_address
@@ -29,6 +28,7 @@ from udp_mesh.core.events import (
     MessageId,
     MessagePeerLost,
     MessageReceived,
+    Receipt,
     Rejected,
     RejectReason,
 )
@@ -37,13 +37,11 @@ from udp_mesh.core.settings import Settings
 from udp_mesh.daemon.driver import Driver
 from udp_mesh.daemon.interface import POSITION_TOPIC
 from udp_mesh.daemon.outbox import DirectoryStore
+from udp_mesh.daemon.unread import RETRY_S, Reading, Unread, UnreadMessages
 from udp_mesh.links.attachments import EVERY_INTERFACE, LinkConfig
 from udp_mesh.wire.limits import BOOT_ID_BYTES
 
 Outcome = MessageDelivered | MessageExpired | MessagePeerLost
-
-MAX_UNREAD = 65_536
-"""Messages or events not yet read by the application; beyond it, the oldest is dropped and counted."""
 
 
 class SendRefusedError(Exception):
@@ -65,6 +63,7 @@ class Node:
         store: DirectoryStore | None = None,
         urgent_dscp: int = 46,
     ) -> None:
+        check_type(settings, Settings, "settings")
         check_items(links, LinkConfig, "links")
         check_type(urgent_dscp, int, "urgent_dscp")
         if not 0 <= urgent_dscp <= 63:
@@ -75,10 +74,9 @@ class Node:
         self._store = store
         self._urgent_dscp = urgent_dscp
         self._driver: Driver | None = None
-        self._messages: deque[MessageReceived] = deque(maxlen=MAX_UNREAD)
-        self._events: deque[Event] = deque(maxlen=MAX_UNREAD)
-        self._arrived = asyncio.Event()
-        self._happened = asyncio.Event()
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._messages = UnreadMessages(self._confirm, self._postpone)
+        self._events: Unread[Event] = Unread()
         self._outcomes: dict[tuple[MessageId, str], asyncio.Future[Outcome]] = {}
 
     async def __aenter__(self) -> Node:
@@ -86,6 +84,11 @@ class Node:
         running already."""
         if self._driver is not None and not self._driver.closed:
             raise RuntimeError("the node is running already: use another `Node` for a second one")
+        self._loop = asyncio.get_running_loop()
+        if self._driver is not None:
+            # The run before was in another loop, perhaps. Its senders send again what was not read then.
+            self._messages = UnreadMessages(self._confirm, self._postpone)
+            self._events, self._outcomes = Unread(), {}
         self._driver = Driver(
             self._settings,
             self._links,
@@ -111,8 +114,14 @@ class Node:
             if not future.done():
                 # Messages that wait on disk have no outcome yet.
                 future.set_exception(RuntimeError("the node was closed before the outcome of the message was known"))
-        self._arrived.set()
-        self._happened.set()
+        self._messages.close()
+        self._events.close()
+
+    @property
+    def messages_dropped(self) -> int:
+        """Messages of this run that were dropped because the program did not read them: beyond 65,536 messages or
+        256 MiB, the oldest is. What its sender keeps on disk comes again later instead."""
+        return self._messages.dropped
 
     @property
     def driver(self) -> Driver:
@@ -142,48 +151,55 @@ class Node:
         if isinstance(outcome, Rejected):
             raise SendRefusedError(outcome)
         future: asyncio.Future[Outcome] = asyncio.get_running_loop().create_future()
-        self._outcomes[outcome, to] = future
+        outcomes = self._outcomes
+        outcomes[outcome, to] = future
         try:
             return await future
         finally:
-            del self._outcomes[outcome, to]
+            del outcomes[outcome, to]
 
     def _accept(self, topic: str, payload: bytes, to: str | None, type_name: str) -> MessageId | Rejected:
+        self._check_loop()
         check_type(topic, str, "topic")
         if to is not None:
             check_type(to, str, "to")
         check_type(type_name, str, "type_name")
         return self.driver.send(topic, _unchanging(payload), destination=to, type_name=type_name)
 
-    async def messages(self) -> AsyncIterator[MessageReceived]:
+    def messages(self) -> AsyncIterator[MessageReceived]:
         """Messages in order of completion, until the node is closed. A message counts as delivered once it is
         yielded."""
-        while True:
-            while self._messages:
-                message = self._messages.popleft()
-                if message.receipt is not None:
-                    self.driver.node.confirm(message.receipt)
-                    self.driver.send_soon()
-                yield message
-            if self.driver.closed:
-                return
-            self._arrived.clear()
-            await self._arrived.wait()
+        return Reading(self._messages, self._check_loop)
 
-    async def events(self) -> AsyncIterator[Event]:
+    def events(self) -> AsyncIterator[Event]:
         """All other events: peers, outcomes, conflicts, starvation."""
-        while True:
-            while self._events:
-                yield self._events.popleft()
-            if self.driver.closed:
-                return
-            self._happened.clear()
-            await self._happened.wait()
+        return Reading(self._events, self._check_loop)
+
+    def _confirm(self, receipt: Receipt) -> None:
+        self.driver.node.confirm(receipt)
+        self.driver.send_soon()
+
+    def _postpone(self, receipt: Receipt) -> None:
+        asyncio.get_running_loop().call_later(RETRY_S, self._request_again, self.driver, receipt)
+
+    def _request_again(self, driver: Driver, receipt: Receipt) -> None:
+        if not driver.closed:
+            driver.node.request_again(receipt)
+            driver.send_soon()
+
+    def _check_loop(self) -> None:
+        """A node is not safe for threads: another one would change it while it sends, and not wake it."""
+        if self._driver is not None and asyncio.get_running_loop() is not self._loop:
+            raise RuntimeError(
+                "the node runs in another event loop: call it there, for example with asyncio.run_coroutine_threadsafe"
+            )
 
     def apply(self, settings: Settings) -> list[str]:
         """Changes topics, window, rates, limits, keys, neighbors. Drops no message. Raises ValueError."""
+        check_type(settings, Settings, "settings")
         _check_addresses(settings)
-        changes = self.driver.apply(replace(settings, confirms=True))
+        settings = replace(settings, confirms=True)
+        changes = self.driver.apply(settings)
         self._settings = settings
         return changes
 
@@ -195,15 +211,13 @@ class Node:
             if event.topic == POSITION_TOPIC:
                 # between daemons
                 return
-            self._messages.append(event)
-            self._arrived.set()
+            self._messages.add(event)
             return
         if isinstance(event, Outcome):
             future = self._outcomes.get((event.message_id, event.peer))
             if future is not None and not future.done():
                 future.set_result(event)
-        self._events.append(event)
-        self._happened.set()
+        self._events.add(event)
 
 
 def _check_addresses(settings: Settings) -> None:

@@ -197,6 +197,10 @@ class DirectoryStore:
 
     def read_all(self) -> Iterator[StoredMessage]:
         """What `load` returns, one by one: the payloads of all may be more than the memory. Read it to its end."""
+        # A node that starts again with its store may find the writes of its last run still under way.
+        # After `close` there are none.
+        with contextlib.suppress(RuntimeError):
+            self._disk.submit(lambda: None).result()
         for path in sorted(self._directory.glob(f"*{SUFFIX}")):
             message = _read(path)
             if message is None or self._path(message.key) != path:
@@ -206,8 +210,9 @@ class DirectoryStore:
                     path.rename(path.with_suffix(".damaged"))
                 continue
             size = path.stat().st_size
-            self._sizes[message.key] = size
-            self.bytes += size
+            with self._lock:
+                self.bytes += size - self._sizes.get(message.key, 0)
+                self._sizes[message.key] = size
             yield message
         for leftover in self._directory.glob("*.new"):
             with contextlib.suppress(OSError):

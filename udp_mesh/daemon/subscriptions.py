@@ -179,7 +179,7 @@ class Subscriptions:
         try:
             expired_at = loop.time() - READ_TIMEOUT_S
             self._reads = {item: at for item, at in self._reads.items() if at > expired_at}
-            # What follows on such a topic waits as well: its order is kept, and each is not asked for in vain.
+            # What follows on such a topic waits as well, which keeps its order.
             without_taker: set[str] = set()
             for key in self._inbox.waiting(self._has_taker):
                 topic = self._inbox.topic(key)

@@ -20,6 +20,7 @@ TOPICS = (
     Topic("status", priority=0),
     Topic("map", priority=7),
     Topic("short", deadline_s=0.2),
+    Topic("short-stored", deadline_s=0.2, outbox=Outbox.ALL),
     Topic("video", reliable=False),
     Topic("stored", outbox=Outbox.ALL, outbox_on_disk=True),
 )
@@ -176,6 +177,94 @@ def test_a_running_node_cannot_be_entered_again() -> None:
         with pytest.raises(RuntimeError, match="running already"):
             await alice.__aenter__()
         assert isinstance(await alice.deliver("map", b"still here", to="bob"), MessageDelivered)
+
+    run(body)
+
+
+def test_a_wait_that_timed_out_does_not_end_the_messages() -> None:
+    async def body(alice: Node, bob: Node) -> None:
+        messages = bob.messages()
+        with pytest.raises(TimeoutError):
+            await asyncio.wait_for(anext(messages), 0.001)
+        await alice.send("map", b"later", to="bob")
+        assert (await anext(messages)).payload == b"later"
+
+    run(body)
+
+
+def test_a_node_is_refused_in_another_loop() -> None:
+    async def body(alice: Node, bob: Node) -> None:
+        def elsewhere(work: Callable[[], Coroutine[Any, Any, Any]]) -> None:
+            with pytest.raises(RuntimeError, match="another event loop"):
+                asyncio.run(work())
+
+        async def read() -> None:
+            await anext(alice.messages())
+
+        await asyncio.to_thread(elsewhere, lambda: alice.send("status", b"", to="bob"))
+        await asyncio.to_thread(elsewhere, lambda: alice.deliver("status", b"", to="bob"))
+        await asyncio.to_thread(elsewhere, read)
+        assert alice.conditions().counters.messages_sent == 0
+
+    run(body)
+
+
+def test_a_node_that_ended_can_run_again_in_another_loop() -> None:
+    port = free_port()
+    nodes = make("alice", 1, 2, port), make("bob", 2, 1, port)
+
+    async def main(payload: bytes) -> None:
+        alice, bob = nodes
+        async with asyncio.timeout(WAIT_S), alice, bob:
+            await asyncio.gather(online(alice, "bob"), online(bob, "alice"))
+            assert isinstance(await alice.deliver("map", payload, to="bob"), MessageDelivered)
+            assert [message.payload for message in bob._messages] == [payload]
+            waiting = asyncio.ensure_future(anext(alice.messages()))
+            await asyncio.sleep(0)
+            await bob.send("map", payload, to="alice")
+            assert (await waiting).payload == payload
+
+    asyncio.run(main(b"first"))
+    asyncio.run(main(b"second"))
+
+
+def test_a_node_that_runs_again_confirms_only_what_is_read() -> None:
+    async def main() -> None:
+        port = free_port()
+        alice, bob = make("alice", 1, 2, port), make("bob", 2, 1, port)
+        async with bob:
+            bob.apply(replace(bob.driver.node.settings, confirms=False))
+        async with asyncio.timeout(WAIT_S), alice, bob:
+            await asyncio.gather(online(alice, "bob"), online(bob, "alice"))
+            assert bob.driver.node.settings.confirms
+
+    asyncio.run(main())
+
+
+def test_a_run_gets_its_outcomes_while_the_waits_of_the_one_before_end() -> None:
+    """The numbers of messages begin again."""
+
+    async def main() -> None:
+        alice = make("alice", 1, 2, free_port())
+        await alice.__aenter__()
+        before = asyncio.ensure_future(alice.deliver("short-stored", b"first", to="bob"))
+        await asyncio.sleep(0)
+        await alice.__aexit__(None, None, None)
+        async with asyncio.timeout(WAIT_S), alice:
+            assert isinstance(await alice.deliver("short-stored", b"second", to="bob"), MessageExpired)
+        await before
+
+    asyncio.run(main())
+
+
+def test_settings_of_another_type_are_named() -> None:
+    wrong: Any = {"name": "alice"}
+    with pytest.raises(TypeError, match="settings: expected Settings, found dict"):
+        Node(wrong)
+
+    async def body(alice: Node, bob: Node) -> None:
+        with pytest.raises(TypeError, match="settings: expected Settings, found dict"):
+            alice.apply(wrong)
 
     run(body)
 

@@ -283,3 +283,15 @@ def test_a_file_that_could_not_be_removed_is_removed_later(
     if not closes:
         store.close()
     assert DirectoryStore(tmp_path, 10_000).load() == []
+
+
+def test_a_node_that_starts_again_with_its_store_finds_each_message_once(tmp_path: Path) -> None:
+    store = DirectoryStore(tmp_path, 1 << 20)
+    for key in range(200):
+        store.put(message(key))
+    written_bytes = store.bytes
+    for _ in range(2):
+        # the writes may still be under way
+        assert [kept.key for kept in store.load()] == list(range(200))
+        assert store.bytes == written_bytes
+    store.close()
