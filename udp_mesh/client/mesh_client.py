@@ -36,6 +36,7 @@ MAX_REPLY_HEADER_BYTES = 1 << 26
 """Maximum header size of a reply or event: the status of a thousand peers takes some megabytes."""
 MAX_PAYLOAD_BYTES = 1 << 30
 _LENGTHS = struct.Struct(">II")
+_TIMEVAL = struct.Struct("@ll")
 _READ_BYTES = 1 << 18
 
 Header = Dict[str, Any]
@@ -147,11 +148,13 @@ class MeshClient:
 
     def __init__(self, path: Optional[str] = None, timeout_s: float = 10.0) -> None:
         """Connects to the socket at `path` (default: that of UDP_MESH_SOCKET in the environment, or the daemon's
-        usual one). Raises MeshError ("unreachable") if no daemon listens there."""
+        usual one). Raises MeshError ("unreachable") if no daemon listens there, or none answers within `timeout_s`."""
         self.path = path = path or os.environ.get(SOCKET_VARIABLE) or DEFAULT_SOCKET
         self.timeout_s = timeout_s
         self._reader = FrameReader()
         self._events: Deque[Frame] = deque()
+        self._requests: Set[int] = set()
+        """Requests whose reply a thread waits for; a later reply is dropped."""
         self._replies: Dict[int, Frame] = {}
         self._delivering: Set[int] = set()
         """Requests whose outcome a thread waits for; these come to `_outcomes`."""
@@ -164,17 +167,23 @@ class MeshClient:
         """Whether a thread reads the socket, for itself and the others."""
         self._is_closed = False
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        # A process-wide default timeout (rospy sets one) must not apply here. The kernel's ends a `connect` to a daemon
+        # that hangs, which with a timeout of Python's fails at once if others are connecting.
+        self._socket.settimeout(None)
+        timeout = divmod(int(1e6 * min(max(timeout_s, 0.001), 1e6)), 1_000_000)
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, _TIMEVAL.pack(*timeout))
         try:
             self._socket.connect(path)
         except OSError as error:
             self._socket.close()
             # connect(2) also fails with "refused" for a file that is not a socket.
             reason = "not a socket" if os.path.exists(path) and not _is_socket(path) else error.strerror or error
+            if isinstance(error, BlockingIOError):
+                reason = "no answer within {:g} s".format(timeout_s)
             raise MeshError("unreachable", "cannot connect to the daemon at {}: {}".format(path, reason)) from error
-        # A process-wide default timeout (rospy sets one) must not apply here.
-        self._socket.settimeout(None)
-        self._poll = select.poll()
+        self._poll, self._poll_write = select.poll(), select.poll()
         self._poll.register(self._socket, select.POLLIN)
+        self._poll_write.register(self._socket, select.POLLOUT)
 
     def __enter__(self) -> "MeshClient":
         return self
@@ -183,15 +192,17 @@ class MeshClient:
         self.close()
 
     def close(self) -> None:
-        """Closes the connection. Threads that wait for messages stop waiting."""
+        """Closes the connection. Threads that wait for messages, or for the daemon to read, stop waiting."""
         with self._arrived:
             self._is_closed = True
+            # wakes them; the one that waits for messages closes the socket
+            self._break()
             if not self._is_reading:
                 self._socket.close()
-                return
-            # The thread that reads is woken by this, and closes the socket.
-            with contextlib.suppress(OSError):
-                self._socket.shutdown(socket.SHUT_RDWR)
+
+    def _break(self) -> None:
+        with contextlib.suppress(OSError):
+            self._socket.shutdown(socket.SHUT_RDWR)
 
     def fileno(self) -> int:
         """For `select`: if readable, `next_frame(0)` may return something. It may also do so after any other call,
@@ -209,14 +220,20 @@ class MeshClient:
         return self._request(next(self._ids), op, payload, fields)
 
     def _request(self, number: int, op: str, payload: bytes, fields: Header) -> Frame:
+        self._requests.add(number)
         try:
-            self._write(dict(fields, op=op, id=number), payload)
-        except MeshError as error:
-            if error.code == "unreachable":
-                # What the daemon sent before it closed the connection says why.
-                self._wait_for(lambda: None, 0.0)
-            raise
-        reply = self._wait_for(lambda: self._replies.pop(number, None), self.timeout_s)
+            try:
+                self._write(dict(fields, op=op, id=number), payload)
+            except MeshError as error:
+                if error.code == "unreachable":
+                    # What the daemon sent before it closed the connection says why.
+                    self._wait_for(lambda: None, 0.0)
+                raise
+            reply = self._wait_for(lambda: self._replies.pop(number, None), self.timeout_s)
+        finally:
+            with self._arrived:
+                self._requests.discard(number)
+                self._replies.pop(number, None)
         if reply is None:
             raise MeshError("timeout", "no reply to {!r} from the daemon within {:g} s".format(op, self.timeout_s))
         header = reply[0]
@@ -323,9 +340,26 @@ class MeshClient:
             raise MeshError("bad-request", text)
         try:
             with self._write_lock:
-                self._socket.sendall(frame)
+                self._send(memoryview(frame))
         except OSError as error:
             raise self._gone("the daemon closed the connection: {}".format(error.strerror)) from error
+
+    def _send(self, rest: memoryview) -> None:
+        """Sends a frame as the daemon reads it. If it is left incomplete, by a daemon that hangs or a Ctrl-C, the
+        connection ends: the daemon would take what follows for the rest of this frame."""
+        started = False
+        try:
+            while rest:
+                try:
+                    rest = rest[self._socket.send(rest, socket.MSG_DONTWAIT) :]
+                    started = True
+                except BlockingIOError:
+                    if not self._poll_write.poll(1000 * self.timeout_s):
+                        text = "the daemon has read nothing for {:g} s".format(self.timeout_s)
+                        raise MeshError("timeout", text) from None
+        finally:
+            if started and rest:
+                self._break()
 
     def _wait_for(self, take: Callable[[], Optional[T]], timeout_s: Optional[float]) -> Optional[T]:
         """Waits until `take` finds something among the received frames; None after `timeout_s` seconds. One of the
@@ -390,7 +424,8 @@ class MeshClient:
             for header, payload in frames:
                 number = header.get("id")
                 if isinstance(number, int) and "event" not in header:
-                    self._replies[number] = (header, payload)
+                    if number in self._requests:
+                        self._replies[number] = (header, payload)
                 elif header.get("event") == "outcome" and header.get("request") in self._delivering:
                     self._outcomes[header["request"]] = header
                 else:

@@ -71,6 +71,7 @@ class Program(MeshClient):
     def post(self, op: str, payload: bytes = b"", **fields: object) -> int:
         """Send a request; its reply comes from `poll`."""
         number = next(self._ids)
+        self._requests.add(number)
         try:
             self._write(dict(fields, op=op, id=number), payload)
         except MeshError:
@@ -85,6 +86,7 @@ class Program(MeshClient):
             self.gone = self.gone or self._socket.fileno() < 0
         replies = {number: frame[0] for number, frame in self._replies.items()}
         self._replies.clear()
+        self._requests -= replies.keys()
         events = list(self._events)
         self._events.clear()
         return replies, events
