@@ -78,7 +78,8 @@ class Client(asyncio.Protocol):
         self.user: int | None = None
         """The client's user id; None if the kernel does not report it."""
         self._deadline: asyncio.TimerHandle | None = None
-        self._partial_before = 0
+        self._received_bytes = self._received_before = 0
+        """Bytes of the connection, and how many there were when the wait for the rest of a request began."""
         self._reader = RequestReader(server.max_payload_bytes)
         self._transport: asyncio.Transport | None = None
         self._dropped = 0
@@ -167,6 +168,7 @@ class Client(asyncio.Protocol):
         self.close()
 
     def data_received(self, data: bytes) -> None:
+        self._received_bytes += len(data)
         for frame in self._reader.feed(data):
             if isinstance(frame, BadFrame):
                 self.refuse(*frame)
@@ -190,7 +192,7 @@ class Client(asyncio.Protocol):
             return
         held = self.partial_request_bytes()
         if held and self._deadline is None:
-            self._partial_before = held
+            self._received_before = self._received_bytes
             self._deadline = asyncio.get_running_loop().call_later(
                 PARTIAL_REQUEST_TIMEOUT_S, self._check_partial_request
             )
@@ -200,7 +202,9 @@ class Client(asyncio.Protocol):
 
     def _check_partial_request(self) -> None:
         self._deadline = None
-        if self.partial_request_bytes() == self._partial_before:
+        # While the client does not read, its requests are not read either.
+        is_reading = self._transport is not None and self._transport.is_reading()
+        if is_reading and self._received_bytes == self._received_before:
             self.refuse(None, "too-slow", f"request incomplete: no data for {PARTIAL_REQUEST_TIMEOUT_S:g} s")
             self.close()
         else:

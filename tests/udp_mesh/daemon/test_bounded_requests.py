@@ -15,6 +15,7 @@ import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import cast
 
 import pytest
 
@@ -245,6 +246,61 @@ def test_an_incomplete_request_times_out(monkeypatch: pytest.MonkeyPatch) -> Non
 
     with tempfile.TemporaryDirectory(prefix="udp-mesh-") as folder:
         asyncio.run(work(Path(folder) / "s"))
+
+
+class PausedTransport:
+    """A connection's transport that the test pauses."""
+
+    def __init__(self) -> None:
+        self.paused = False
+        self.closed = False
+
+    def is_reading(self) -> bool:
+        return not self.paused
+
+    def pause_reading(self) -> None:
+        self.paused = True
+
+    def get_write_buffer_size(self) -> int:
+        return 0
+
+    def get_extra_info(self, _: str) -> None:
+        return None
+
+    def is_closing(self) -> bool:
+        return self.closed
+
+    def write(self, _: bytes) -> None: ...
+
+    def close(self) -> None:
+        self.closed = True
+
+
+def test_a_request_is_too_slow_only_if_it_could_have_been_read(tmp_path: Path) -> None:
+    whole = encode_frame({"op": "x", "id": 1}, b"")
+
+    closed: list[bool] = []
+
+    async def main() -> None:
+        server = api.LocalServer(Handler(), tmp_path / "s", mode=0o600, group=None, max_payload_bytes=lambda: 1000)
+        client, transport = api.Client(server), PausedTransport()
+        client.connection_made(cast(asyncio.BaseTransport, transport))
+        client.data_received(whole[:5])
+        # The rest came, and as much of the next request.
+        client.data_received(whole[5:] + whole[:5])
+        client._check_partial_request()
+        closed.append(transport.closed)
+        # The client does not read its replies, so that its requests wait.
+        transport.pause_reading()
+        client._check_partial_request()
+        closed.append(transport.closed)
+        transport.paused = False
+        client._check_partial_request()
+        closed.append(transport.closed)
+        client.connection_lost(None)
+
+    asyncio.run(main())
+    assert closed == [False, False, True]
 
 
 RECORD_AS_ANOTHER_USER = """
