@@ -163,9 +163,10 @@ def _retopic(state: State, now: float) -> None:
         if topic is not None:
             channel.topic = topic
     for name in list(state.rate_limits):
-        rate = state.topics[name].rate_limit_bytes_per_s if name in state.topics else None
+        limited = state.named_topic(name)
+        rate = None if limited is None else limited.rate_limit_bytes_per_s
         bucket = state.rate_limits[name]
-        bucket.unpark()
+        bucket.unpark_all()
         if rate is None:
             del state.rate_limits[name]
         else:

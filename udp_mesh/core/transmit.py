@@ -256,7 +256,7 @@ def next_timer(state: State) -> float | None:
     """See `Endpoint.next_timer`."""
     at = min(state.maintenance_at, state.heartbeats.next_at, state.broadcasts.next_at(), state.next_peer_at())
     for bucket in state.rate_limits.values():
-        if bucket.parked:
+        if bucket.has_parked:
             at = min(at, bucket.ready_at())
     if (state.compression_queue or state.inflating or state.versions.has_work) and not state.closed:
         # Due at once, repeatedly; other timers are handled in between.
@@ -294,12 +294,13 @@ def handle_timer(state: State, now: float) -> None:
     if state.heartbeats.next_at <= now:
         _send_heartbeats(state, now)
     for bucket in state.rate_limits.values():
-        if bucket.parked and bucket.has_tokens(now):
-            waiting = {sender for sender, _ in bucket.parked}
-            bucket.unpark()
-            for peer in state.peer_table.peers.values():
-                if peer.sender in waiting:
-                    state.ready[peer] = None
+        if bucket.has_parked and (in_turn := bucket.unpark(now)):
+            peers = {peer.sender: peer for peer in state.peer_table.peers.values()}
+            for sender in in_turn:
+                if (waiting := peers.get(sender)) is not None:
+                    # to the end, so that the order is that of the turns
+                    state.ready.pop(waiting, None)
+                    state.ready[waiting] = None
     broadcasts: list[Datagram] = []
     state.broadcasts.send_copies(now, broadcasts)
     state.outgoing.extend(broadcasts)

@@ -122,7 +122,7 @@ def check_finished(team: RandomTeam) -> None:
         if left.queued_bytes or left.partial_bytes or state.outboxes.bytes or state.compression_queue.bytes:
             raise Broken(f"{name} still holds {left.queued_bytes} B to send, {left.partial_bytes} B received")
         for bucket in state.rate_limits.values():
-            if any(not run.message.ended for _, run in bucket.parked):
+            if any(not run.message.ended for run in bucket.parked()):
                 raise Broken(f"{name} has parked messages")
         for peer in state.peer_table.peers.values():
             sender = peer.sender

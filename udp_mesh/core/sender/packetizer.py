@@ -103,9 +103,9 @@ def send_level(
             sender.finish(message, ExpiryReason.SUPERSEDED)
             continue
         bucket = rate_limits.get(message.accepted.channel.name) if rate_limits else None
-        if bucket is not None and not bucket.has_tokens(now):
+        if bucket is not None and bucket.must_wait(sender, run, now):
             sender.scheduler.park_head(run)
-            bucket.parked.append((sender, run))
+            bucket.park(sender, run)
             continue
         if not message.started:
             version = message.version
@@ -125,7 +125,7 @@ def send_level(
             count = 1
             used += _send_datagram(sender, path, run, urgent, snapshot, out)
         if bucket is not None:
-            bucket.consume(used - before)
+            bucket.consume(used - before, sender)
         if sender.probing.credit:
             sender.probing.credit = max(0, sender.probing.credit - count)
         if urgent:
