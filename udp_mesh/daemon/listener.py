@@ -50,8 +50,7 @@ class Listener:
     def open(self) -> None:
         """Listens. Raises OSError: in use by another daemon, no such directory or group, permission denied."""
         self._path.parent.mkdir(parents=True, exist_ok=True)
-        if _is_answered(self._path):
-            raise OSError(f"{self._path}: another daemon is already listening")
+        check_unused(self._path)
         if self._path.exists() and not self._path.is_socket():
             what = "a directory" if self._path.is_dir() else "a file"
             raise OSError(f"{self._path}: expected no file or a stale socket, found {what}")
@@ -163,6 +162,12 @@ def _identity(path: Path) -> tuple[int, int] | None:
     except OSError:
         return None
     return found.st_dev, found.st_ino
+
+
+def check_unused(path: Path) -> None:
+    """Raises OSError if a daemon listens at this path."""
+    if _is_answered(path):
+        raise OSError(f"{path}: another daemon is already listening")
 
 
 def _is_answered(path: Path) -> bool:

@@ -187,11 +187,16 @@ def test_systemd_is_notified_of_readiness_watchdog_reload_and_stop() -> None:
         assert "Traceback" not in alice.log.read_text()
 
 
-def test_a_second_daemon_does_not_take_the_firsts_socket_or_port() -> None:
+def test_a_second_daemon_does_not_take_the_firsts_socket_port_or_files() -> None:
     with tempfile.TemporaryDirectory(prefix="udp-mesh-") as path:
         folder = Path(path)
         first = RunningDaemon(folder, "alice", configuration(folder, "alice", 1, [2], free_port()))
         with first:
+            outbox = folder / "alice" / "outbox"
+            outbox.mkdir(parents=True, exist_ok=True)
+            being_written, kept = outbox / f"{7:020d}.new", outbox / f"{6:020d}.message"
+            being_written.write_bytes(b"half of")
+            kept.write_bytes(b"not all of it is on this disk")
             second = subprocess.run(
                 [sys.executable, "-m", "udp_mesh.cli.main", "run", str(first.file)],
                 check=False,
@@ -202,6 +207,8 @@ def test_a_second_daemon_does_not_take_the_firsts_socket_or_port() -> None:
             assert second.returncode == 1
             assert f"cannot start: {first.socket}: another daemon is already listening" in second.stderr
             assert "Traceback" not in second.stderr
+            assert being_written.exists()
+            assert kept.exists()
             with first.client() as client:
                 client.request("peers")
 
