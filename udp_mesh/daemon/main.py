@@ -21,6 +21,7 @@ from udp_mesh.daemon.api import LocalServer, RequestError
 from udp_mesh.daemon.commands import COMMANDS, render_metrics
 from udp_mesh.daemon.configuration import Configuration, load
 from udp_mesh.daemon.file_access import FILE_TIMEOUT_S, off_loop
+from udp_mesh.daemon.heap import map_large_blocks
 from udp_mesh.daemon.listener import check_unused
 from udp_mesh.daemon.metrics_server import MetricsServer
 from udp_mesh.daemon.privileges import drop_privileges
@@ -37,6 +38,7 @@ GC_THRESHOLDS = (20_000, 50, 50)
 
 async def run(configuration: Configuration) -> None:
     """Runs the daemon until SIGTERM or SIGINT. Raises OSError if it cannot start."""
+    map_large_blocks()
     # before it reads the state directory: that may be the other daemon's, which is writing there
     check_unused(configuration.daemon.socket)
     if configuration.settings.unkeyed:
