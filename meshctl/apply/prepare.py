@@ -10,7 +10,9 @@ import time
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from types import MappingProxyType
 
+from meshctl.apply.commit_confirm import GRACE_AFTER_WINDOW_S
 from meshctl.apply.images import CheckedImages
 from meshctl.apply.reconnect import RELEARN_S, last_relays, reconnect
 from meshctl.device.observation import Observation
@@ -134,8 +136,22 @@ def prepare(
             return replace(again, plan=replace(again.plan, notes=(*repaired.notes, *again.plan.notes)))
     pace = Pace.of(journal.change_durations_s(fleet.name))
     return _with_fleet_plan(
-        fleet, single, observed, journal.last_known(fleet.name), salt=salt, choices=decided, pace=pace
+        fleet,
+        single,
+        observed,
+        journal.last_known(fleet.name),
+        salt=salt,
+        choices=decided,
+        pace=pace,
+        returning=_returning(fleet, away, journal),
     )
+
+
+def _returning(fleet: Fleet, away: Iterable[str], journal: Journal) -> dict[str, float]:
+    """Until when (Unix time) unreachable nodes may roll back a change whose end no run has observed."""
+    window_s = max((node.confirm_window_s for node in fleet.managed()), default=0)
+    started = journal.unconfirmed_changes(fleet.name)
+    return {name: started[name] + window_s + GRACE_AFTER_WINDOW_S for name in away if name in started}
 
 
 def _remember(journal: Journal, fleet: Fleet, observed: FleetObservation) -> None:
@@ -272,6 +288,7 @@ def _with_fleet_plan(
     salt: bytes,
     choices: PlanOptions,
     pace: Pace | None = None,
+    returning: Mapping[str, float] = MappingProxyType({}),
 ) -> Prepared:
     plans = dict(single.plans)
     away = [name for name, made in plans.items() if made.verdict is Verdict.AWAY]
@@ -288,6 +305,7 @@ def _with_fleet_plan(
         accept_cuts=choices.accept_cuts,
         together=choices.together,
         pace=pace,
+        returning=returning,
         never_meshed=[name for name in single.plans if name in known and known[name].facts.get("cell") == "none"],
     )
     return Prepared(plan, single.desired, observed, salt)

@@ -225,10 +225,17 @@ class Journal:
 
     def unfinished_changes(self, fleet: str) -> dict[str, float]:
         """Node -> when its first change started (Unix time) whose end no run has observed."""
+        return self._unfinished(fleet, "MIN", "'apply', 'flash'")
+
+    def unconfirmed_changes(self, fleet: str) -> dict[str, float]:
+        """Node -> when its latest change of files started (Unix time) whose end no run has observed."""
+        return self._unfinished(fleet, "MAX", "'apply'")
+
+    def _unfinished(self, fleet: str, pick: str, steps: str) -> dict[str, float]:
         ended = ", ".join(f"'{result.value}'" for result in Result if result not in _END_UNKNOWN)
         rows = self._store.read(
-            "SELECT node, MIN(steps.began_s) FROM steps JOIN runs ON runs.id = run WHERE fleet = ?1"
-            " AND command NOT LIKE 'robots %' AND step IN ('apply', 'flash') AND NOT EXISTS"
+            f"SELECT node, {pick}(steps.began_s) FROM steps JOIN runs ON runs.id = run WHERE fleet = ?1"
+            f" AND command NOT LIKE 'robots %' AND step IN ({steps}) AND NOT EXISTS"
             " (SELECT 1 FROM outcomes AS later JOIN runs AS after ON after.id = later.run WHERE after.fleet = ?1"
             " AND later.node = steps.node AND later.run >= steps.run AND after.command NOT LIKE 'robots %'"
             f" AND later.result IN ({ended})) GROUP BY node ORDER BY node",

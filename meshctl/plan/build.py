@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from datetime import UTC, datetime
 from types import MappingProxyType
 
 from meshctl.model import Fleet
@@ -29,6 +30,7 @@ def fleet_plan(
     accept_cuts: Iterable[str] = (),
     together: bool = False,
     pace: Pace | None = None,
+    returning: Mapping[str, float] = MappingProxyType({}),
 ) -> Plan:
     """The stages for these nodes. `entry` is the node through which the mesh is reached (default: the base
     of each node's site).
@@ -36,6 +38,7 @@ def fleet_plan(
     `unchanged` are other members of their meshes, which show the cell that the mesh runs. `leave_behind` acknowledges
     nodes that are off during a change of their mesh, `accept_cuts` cut vertices that may be flashed; `all` means any.
     `together`: all nodes of running meshes change simultaneously. `pace` is that of earlier changes.
+    `returning`: node -> until when (Unix time) it may roll back an unconfirmed change by itself.
     """
     entries = (entry,) if entry else tuple(fleet.bases_of(plans))
     acknowledged = tuple(leave_behind)
@@ -47,7 +50,14 @@ def fleet_plan(
     at_once = stages_together(todo, surroundings, found.nodes)
     stages = at_once if together else in_order
     cut_off_by = graph.cut_off_by_any(entries)
-    refusal, hint = _refusal(found, plans, cut_off_by, frozenset(accept_cuts), acknowledged)
+    refusal, hint = _refusal(
+        found,
+        plans,
+        cut_off_by,
+        frozenset(accept_cuts),
+        acknowledged,
+        {name: until_s for name, until_s in returning.items() if until_s > now_s},
+    )
     if together and not refusal:
         refusal, hint = _refused_together(at_once, plans)
     windows = [fleet.nodes[plan.node].confirm_window_s for plan in todo]
@@ -123,6 +133,7 @@ def _refusal(
     cut_off_by: Mapping[str, tuple[str, ...]],
     accepted: frozenset[str],
     acknowledged: tuple[str, ...],
+    returning: Mapping[str, float],
 ) -> tuple[str, str]:
     for mesh, why in found.blocked.items():
         flashes = any(plan.firmware is not None and mesh in plan.parted_from for plan in plans.values())
@@ -133,6 +144,15 @@ def _refusal(
             else "fix the refused nodes, then plan again",
         )
     for mesh, names in found.left_behind.items():
+        waiting = [name for name in names if name in returning]
+        if waiting:
+            # acknowledged, they would return to the old cell after the others have left it
+            until = datetime.fromtimestamp(max(returning[name] for name in waiting), UTC)
+            return (
+                f"mesh {mesh} changes its cell, and {node_list(waiting)} may still roll back an earlier change, to the "
+                "cell that the others would leave",
+                f"plan again when they answer, or at the latest after {until:%H:%M:%S} UTC",
+            )
         # one option with all of them, also those that were given already
         needed = (*acknowledged, *names)
         few = len(needed) <= MAX_IN_FULL

@@ -75,6 +75,14 @@ def test_a_change_is_unfinished_from_its_start_until_a_run_reaches_its_node_agai
         robots.finish_node(Outcome("a", Result.DONE))
         assert journal.unfinished_changes("f") == lost
         assert journal.unfinished_changes("other") == {}
+        fourth = journal.begin("provision", fleet="f", inventory="inv", nodes=("a", "b"))
+        for name, step in (("a", "apply"), ("b", "flash")):
+            with fourth.step(name, step):
+                pass
+        assert journal.unfinished_changes("f")["a"] == lost["a"]
+        # a flash is not rolled back
+        assert journal.unconfirmed_changes("f") == {"a": journal.steps(fourth.id, "a")[0].began_s}
+        fourth.finish_node(Outcome("b", Result.DONE))
         third = journal.begin("provision", fleet="f", inventory="inv", nodes=("a",))
         third.finish_node(Outcome("a", Result.UNCHANGED))
         assert journal.unfinished_changes("f") == {}

@@ -84,6 +84,16 @@ def test_a_switch_leaves_nodes_behind_only_if_acknowledged() -> None:
     assert fleet_plan(spare, plans(new, seen), STAR, now_s=0.0).refusal == ""
 
 
+def test_a_node_that_may_still_return_to_its_former_cell_is_waited_for() -> None:
+    new = fleet(channel=11)
+    seen = {name: None if name in ("b03", "b04") else running(fleet(), name) for name in TEAM}
+    plan = fleet_plan(new, plans(new, seen), STAR, now_s=100.0, returning={"b03": 161.0})
+    assert plan.refusal.startswith("mesh main changes its cell, and b03 may still roll back an earlier change")
+    assert plan.refusal_hint == "plan again when they answer, or at the latest after 00:02:41 UTC"
+    later = fleet_plan(new, plans(new, seen), STAR, now_s=162.0, returning={"b03": 161.0})
+    assert "would leave behind b03, b04" in later.refusal
+
+
 def test_a_switch_of_a_part_of_the_mesh_is_refused() -> None:
     new = fleet(channel=11)
     some = plans(new, {name: running(fleet(), name) for name in TEAM[:3]})
