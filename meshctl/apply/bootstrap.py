@@ -21,8 +21,9 @@ from meshctl.errors import NodeError
 from meshctl.fleet import Interrupt, Observer, Outcome, Result, run, silent
 from meshctl.fleet.journal import LastKnown
 from meshctl.model import Fleet, Node
-from meshctl.nodes.collect import FleetObservation, observe_cleared
+from meshctl.nodes.collect import FleetObservation
 from meshctl.nodes.connections import ConnectionPool
+from meshctl.nodes.dead_changes import observe_cleared
 from meshctl.nodes.desired import Renderer
 from meshctl.topology import alternate_macs
 

@@ -29,8 +29,8 @@ from meshctl.device.trust import AcceptAnyKey, HostKey, TrustStore
 from meshctl.errors import InputError, NodeError, Unreachable
 from meshctl.fleet import Interrupt, Result
 from meshctl.model import Fleet, Node, NodeState, Role
-from meshctl.nodes.collect import observe_cleared
 from meshctl.nodes.connections import ConnectionPool
+from meshctl.nodes.dead_changes import observe_cleared
 from meshctl.nodes.desired import Renderer
 
 

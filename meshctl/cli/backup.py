@@ -51,7 +51,8 @@ from meshctl.device.observation import Observation
 from meshctl.errors import InputError
 from meshctl.fleet import Outcome, Result, run
 from meshctl.model import Node
-from meshctl.nodes.collect import facts_of, observe_cleared
+from meshctl.nodes.collect import facts_of
+from meshctl.nodes.dead_changes import observe_cleared
 from meshctl.nodes.slots import transfers_at_once
 from meshctl.plan import Cut, Effect, NodePlan, Verdict
 from meshctl.wording import counted

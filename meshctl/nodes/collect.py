@@ -1,35 +1,28 @@
 """Observe many nodes: their observations, why others gave none, and the mesh graph.
 
-`collect` observes nodes in parallel over pooled connections. A lock or an armed change that a dead meshctl process of
-this machine left on a node is cleared first, because nothing else removes it before it expires.
+`collect` observes nodes in parallel over pooled connections. Where a dead meshctl process of this machine left a lock
+or an armed change, it clears these and observes again (`dead_changes`).
 """
 
 from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field
 from ipaddress import ip_address
 
-from meshctl.device import deadman
-from meshctl.device.errors import NodeRefused, Timeout
-from meshctl.device.observation import ChangeStatus, Observation
+from meshctl.device.errors import Timeout
+from meshctl.device.observation import Observation
 from meshctl.device.observe import observe
-from meshctl.device.ssh import SshConnection
 from meshctl.errors import NodeError, Unreachable
 from meshctl.fleet import Interrupt, Observer, Outcome, Result, run, silent
 from meshctl.fleet.journal import LastKnown
-from meshctl.fleet.process import is_dead
 from meshctl.model import Fleet, Node, NodeState
-from meshctl.nodes.backoff import Backoff
 from meshctl.nodes.connections import ConnectionPool, SshAddress
+from meshctl.nodes.dead_changes import clear_all, is_left_by_dead
 from meshctl.plan.lockout import SSH_PORT, listening_ports
 from meshctl.plan.observed_files import management_address, parsed
 from meshctl.topology import Graph, Report, mesh_macs, observed_graph, report_of, with_alternates
-
-# How long a node may take to roll back a change of a dead process: its files, and a reload.
-CLEARING_S = 60.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,7 +115,7 @@ def collect(
     def observe_one(name: str) -> Outcome:
         try:
             with connections.slots.use(name), connections.borrow(wanted[name]) as connection:
-                observation = observe_cleared(connection, tuple(paths(wanted[name])), signal)
+                observation = observe(connection, extra_paths=tuple(paths(wanted[name])))
         except NodeError as error:
             with lock:
                 errors[name] = error
@@ -132,8 +125,23 @@ def collect(
         return Outcome(name, Result.DONE)
 
     outcomes = run(wanted, observe_one, parallel=parallel, interrupt=signal, observer=observer)
+    if any(is_left_by_dead(observation) for observation in found.values()) and not signal.stopping:
+        graph = fleet_graph(connections.fleet, {}, reports_of(found))
+        cleared, lost = clear_all(
+            connections,
+            wanted,
+            found,
+            graph,
+            paths=lambda node: tuple(paths(node)),
+            parallel=parallel,
+            interrupt=signal,
+        )
+        found |= cleared
+        for name, error in lost.items():
+            found.pop(name, None)
+            errors[name] = error
     unreachable = {
-        name: outcome.reason
+        name: str(errors[name]) if name in errors else outcome.reason
         for name, outcome in outcomes.items()
         if name not in found and (name not in errors or isinstance(errors[name], Unreachable))
     }
@@ -144,33 +152,6 @@ def collect(
     return FleetObservation(
         {name: found[name] for name in wanted if name in found}, unreachable, refused, silent_servers
     )
-
-
-def observe_cleared(connection: SshConnection, paths: tuple[str, ...], interrupt: Interrupt) -> Observation:
-    """One observation, after clearing the lock and change of a dead meshctl process of this machine."""
-    observation = observe(connection, extra_paths=paths)
-    change = observation.change
-    if change is None or not (is_dead(change.lock_owner) or (is_dead(change.owner) and change.state != "idle")):
-        return observation
-    backoff = Backoff(CLEARING_S, interrupt)
-    while not backoff.is_over and not interrupt.leaving:
-        _clear(connection, change)
-        observation = observe(connection, extra_paths=paths)
-        change = observation.change
-        if change is None or not is_dead(change.owner) or change.state in ("idle", "staged"):
-            break
-        backoff.pause()
-    return observation
-
-
-def _clear(connection: SshConnection, change: ChangeStatus) -> None:
-    # if the node refuses, its next status shows why
-    with suppress(NodeRefused):
-        if is_dead(change.owner) and change.change_id and change.state not in ("idle", "restoring"):
-            deadman.abort(connection, change.owner, change.change_id)
-    with suppress(NodeRefused):
-        if is_dead(change.lock_owner):
-            deadman.unlock(connection, change.lock_owner)
 
 
 def facts_of(observation: Observation) -> dict[str, str]:
