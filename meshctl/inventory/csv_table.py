@@ -24,8 +24,9 @@ from meshctl.inventory.fields import Name
 from meshctl.inventory.tree import Plain
 from meshctl.inventory.validate import expected_value
 from meshctl.inventory.yaml_text import Value
-from meshctl.model import Fleet, Node
+from meshctl.model import Fleet, Node, NodeState
 from meshctl.suggest import did_you_mean
+from meshctl.wording import join_limited
 
 NODE = "node"
 _GETTERS: Mapping[str, Callable[[Node], str]] = {
@@ -46,7 +47,8 @@ _LISTS = ("groups",)
 # an error of Python's reader, for a cell that begins with a quotation mark and extends to the end of the file
 _UNCLOSED = "unexpected end of data"
 # no two devices have the same one
-_UNIQUE = (NODE, "label", "serial", "mac")
+_IDENTIFIERS = ("label", "serial", "mac")
+_UNIQUE = (NODE, *_IDENTIFIERS)
 _DELIMITERS = ",;\t"
 # MAC addresses as inventories, labels, barcodes and switches write them
 _MAC = re.compile(r"[0-9a-f]{2}(?:[:-]?[0-9a-f]{2}){5}|[0-9a-f]{4}(?:\.[0-9a-f]{4}){2}", re.IGNORECASE)
@@ -150,9 +152,33 @@ def edits(rows: Iterable[Row], fleet: Fleet, file: str, *, add: bool = False) ->
                 "give --add to add new nodes" if name else "new nodes need a column 'node'"
             )
             errors.append(_wrong(place, key, "a node of the inventory", f"'{printable(word)}'", hint))
+    errors += _unknown_or_taken(found, fleet, file)
     if errors:
         raise InvalidInput(errors[: codes.MAX_DIAGNOSTICS])
     return tuple(found)
+
+
+def _unknown_or_taken(found: Iterable[NodeEdit], fleet: Fleet, file: str) -> Iterator[Diagnostic]:
+    """Sites that the inventory does not have, and identifiers that another node has after these edits."""
+    edited = {edit.node: edit for edit in found}
+    owners: dict[tuple[str, str], str] = {}
+    for node in fleet.nodes.values():
+        values = edited[node.name].values if node.name in edited else {}
+        for column in _IDENTIFIERS:
+            text = _GETTERS[column](node)
+            if text and column not in values and node.state is not NodeState.RETIRED:
+                owners[column, text.lower()] = node.name
+    for edit in edited.values():
+        place = Position(file, edit.line)
+        site = edit.values.get("site")
+        if site is not None and site not in fleet.sites:
+            expected = f"a site of the inventory ({join_limited(list(fleet.sites))})" if fleet.sites else "no site"
+            yield _wrong(place, "site", expected, f"'{printable(str(site))}'", did_you_mean(str(site), fleet.sites))
+        for column in _IDENTIFIERS:
+            owner = owners.get((column, str(edit.values.get(column, "")).lower()))
+            if owner is not None:
+                text = printable(str(edit.values[column]))
+                yield _wrong(place, column, "a value of one device", f"'{text}', which node {owner} has")
 
 
 def _records(text: str, file: str) -> Iterator[tuple[int, list[str]]]:

@@ -166,6 +166,24 @@ def test_an_invalid_table_is_reported_with_its_line(table: str, line: int, text:
     assert text in found
 
 
+def test_a_site_and_an_identifier_that_a_table_cannot_give_are_errors(inventory: Path) -> None:
+    path = inventory / "fleet.yaml"
+    text = path.read_text(encoding="utf-8") + "\nsites: {mine: {}, field: {}}\n"
+    path.write_text(text, encoding="utf-8")
+    assert run(inventory, "node,mac,serial\nbase,02:00:5e:00:00:01,S1\n").exit_code == 0
+    rows = read("node,site,mac\nhusky1-b01,Mine,\nhusky1-b02,,02:00:5E:00:00:01\n", "boxes.csv")
+    with pytest.raises(InvalidInput) as raised:
+        edits(rows, load_fleet(inventory), "boxes.csv")
+    site, mac = map(str, raised.value.diagnostics)
+    assert raised.value.diagnostics[0].hint == "did you mean 'mine'?"
+    assert "boxes.csv:2: site: expected a site of the inventory (mine, field), found 'Mine' [INV040]" in site
+    assert "boxes.csv:3: mac: expected a value of one device, found '02:00:5e:00:00:01', which node base has" in mac
+    # another device takes over the serial number, and base gets a new one
+    swapped = run(inventory, "node,serial,site\nhusky1-b01,S1,mine\nbase,S2,\n")
+    assert swapped.exit_code == 0, swapped.output
+    assert load_fleet(inventory).nodes["husky1-b01"].serial == "S1"
+
+
 def test_a_table_in_another_encoding_names_the_line(inventory: Path, tmp_path: Path) -> None:
     (tmp_path / "boxes.csv").write_bytes("node,label\nbase,B\nhusky1-b01,Käfer\n".encode("latin-1"))
     words = ["inventory", "import", str(tmp_path / "boxes.csv"), "-i", str(inventory)]
