@@ -19,6 +19,7 @@ from meshctl.cli.history_follow import follow as follow_runs
 from meshctl.cli.output import echo, echo_error, echo_json, terminal_width
 from meshctl.cli.run_record import run_number
 from meshctl.errors import InputError
+from meshctl.fleet import Result
 from meshctl.fleet.journal import Journal, RunRecord
 from meshctl.fleet.journal_store import open_journal
 from meshctl.fleet.run_files import CHANGES, RunFiles
@@ -69,7 +70,7 @@ def history(
         elif run is None:
             _list_runs(journal, run_filter, limit, as_json=as_json)
         else:
-            number = run_number(run, _selected_runs(journal, run_filter))
+            number = run_number(run, _selected_runs(journal, run_filter), of=run_filter.text)
             _show_run(journal, number, node, as_json=as_json, with_diffs=diff)
 
 
@@ -183,7 +184,7 @@ def _show_run(journal: Journal, run_id: int, node: str | None, *, as_json: bool,
     for outcome in outcomes:
         _echo_wrapped(f"{outcome}" + (f" ({outcome.duration_s:.1f} s)" if outcome.duration_s else ""))
         for change in changes.get(outcome.node, ()):
-            _echo_wrapped(f"  {change.kind} /{change.path}: {summary(change)}".rstrip(": "))
+            _echo_wrapped(f"  {_kept(outcome.result)}{change.kind} /{change.path}: {summary(change)}".rstrip(": "))
             if with_diffs:
                 for line in diff_lines(change):
                     echo(f"    {line}")
@@ -192,6 +193,13 @@ def _show_run(journal: Journal, run_id: int, node: str | None, *, as_json: bool,
                 took = "interrupted" if step.duration_s is None else f"{step.duration_s:.2f} s"
                 result = "" if step.result == "done" else step.result
                 _echo_wrapped(f"  {step.step:<{width}} {took:>10}  {result}".rstrip())
+
+
+def _kept(result: Result) -> str:
+    """What became of a node's planned changes; empty if they are in force."""
+    if result is Result.DONE:
+        return ""
+    return "rolled back: " if result is Result.ROLLED_BACK else "planned: "
 
 
 def _echo_wrapped(text: str) -> None:

@@ -12,12 +12,13 @@ LAST = "last"
 _MAX_DIGITS = 18
 
 
-def run_number(text: str, latest: Iterable[RunRecord]) -> int:
-    """The number of the run that `text` names; `last` names the first of `latest`. Raises InputError for other text."""
+def run_number(text: str, latest: Iterable[RunRecord], *, of: str = "") -> int:
+    """The number of the run that `text` names; `last` names the first of `latest`, which are those ` of` a selection.
+    Raises InputError for other text."""
     if text == LAST:
         newest = next(iter(latest), None)
         if newest is None:
-            raise InputError("there is no run yet", hint="run `meshctl history` to list all runs")
+            raise InputError(f"there is no run{of or ' yet'}", hint="run `meshctl history` to list all runs")
         return newest.id
     if not (text.isascii() and text.isdigit() and len(text) <= _MAX_DIGITS):
         raise InputError(

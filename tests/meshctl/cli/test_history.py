@@ -12,6 +12,7 @@ from meshctl.cli.main import main
 from meshctl.errors import InputError
 from meshctl.fleet import Outcome, Result
 from meshctl.fleet.journal import Journal
+from meshctl.fleet.run_files import CHANGES, RunFiles
 
 
 @pytest.fixture
@@ -59,12 +60,32 @@ def test_a_run_is_wrapped_at_the_width_of_the_terminal(
     assert f"b01: rolled back: {reason}" in said(capfd, "1").splitlines()
 
 
+def test_what_a_run_did_not_change_is_not_called_changed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    diff = "--- a\n+++ b\n@@ -1 +1 @@\n-config radio\n+config wifi-device\n"
+    with Journal(tmp_path / "meshctl" / "journal.sqlite") as journal:
+        run = journal.begin("provision", fleet="mine", inventory="/x", nodes=("b01", "b02", "b03"))
+        change = ("etc/config/wireless", "changed", diff)
+        RunFiles(journal.path).save(run.id, CHANGES, {name: [change] for name in ("b01", "b02", "b03")})
+        for name, result in (("b01", Result.DONE), ("b02", Result.ROLLED_BACK), ("b03", Result.REFUSED)):
+            run.finish_node(Outcome(name, result))
+        run.end("1 done, 1 rolled back, 1 refused")
+    lines = [line.partition("/etc/config/wireless")[0].strip() for line in said(capfd, "1").splitlines()]
+    kept = ["b01: done", "changed", "b02: rolled back", "rolled back: changed"]
+    assert lines[2:] == [*kept, "b03: refused", "planned: changed"]
+
+
 @pytest.mark.usefixtures("journal")
 def test_the_last_run_is_the_first_of_those_that_are_listed(capfd: pytest.CaptureFixture[str]) -> None:
     assert said(capfd, "last").startswith("run 4: provision of mine ")
     assert said(capfd, "last", "--fleet", "ruins").startswith("run 3: ")
     assert said(capfd, "last", "--virtual").startswith("run 2: provision of mine (lab) ")
     assert json.loads(said(capfd, "last", "--json"))["run"] == 4
+    with pytest.raises(SystemExit):
+        main(["history", "last", "--node", "b77"])
+    assert "error: there is no run of b77" in capfd.readouterr().err
 
 
 @pytest.mark.usefixtures("journal")
