@@ -46,6 +46,10 @@ def wait_until_it_has_moved(rig: Rig, name: str) -> None:
 
 def test_a_killed_change_of_the_mesh_is_rolled_back_on_all_nodes_before_the_next_plan(rig: Rig) -> None:
     kill_after_the_switch(rig)
+    # what the next command ends does not prevent it
+    seen = json.loads(rig.meshctl("status", "split", "--json").out)
+    assert {node["name"] for node in seen["nodes"] if node["answers"]} == {"base", *rig.names}
+    assert "refused" not in {alarm["code"] for node in seen["nodes"] for alarm in node["alarms"]}
     planned = rig.meshctl("plan", "split", "--json")
     assert planned.code == 0, planned.out + planned.err
     verdicts = {node["node"]: node["verdict"] for node in json.loads(planned.out)["nodes"]}
