@@ -25,30 +25,25 @@ _GIT_TIMEOUT_S = 120
 
 @dataclass(frozen=True, slots=True)
 class InventoryCheckout:
-    """`path` is readable within the context of `checkout`; messages show `label` in place of `root`."""
+    """`path` is readable within the context of `checkout`."""
 
     path: Path
-    root: str = ""
-    label: str = ""
 
     def fleet(self) -> Fleet:
-        """Load the fleet. Raises InvalidInput with positions in the revision."""
-        try:
-            return load_fleet(self.path, environ=os.environ)
-        except InvalidInput as error:
-            if not self.root:
-                raise
-            raise InvalidInput(
-                replace(item, position=replace(item.position, file=item.position.file.replace(self.root, self.label)))
-                for item in error.diagnostics
-            ) from error
+        return load_fleet(self.path, environ=os.environ)
 
 
 @contextmanager
 def checkout(argument: str) -> Iterator[InventoryCheckout]:
-    """The inventory at `argument`; an existing path wins over a revision. Raises InputError if there is none."""
+    """The inventory at `argument`; an existing path wins over a revision. Raises InputError if there is none.
+
+    Errors of the inventory that are raised within the context have positions in the revision.
+    """
     revision, colon, path = argument.partition(":")
     if Path(argument).exists() or not colon:
+        if not Path(argument).exists() and _commit(argument, dict(os.environ)):
+            hint = f"for a revision of git, add the path of the inventory in it, such as {argument}:./"
+            raise InputError(f"{argument}: no such file or directory", hint=hint)
         yield InventoryCheckout(Path(argument))
         return
     with tempfile.TemporaryDirectory(prefix="meshctl-diff-") as folder:
@@ -58,7 +53,9 @@ def checkout(argument: str) -> Iterator[InventoryCheckout]:
         top = _git("rev-parse", "--show-toplevel", environ=environ)
         # as in git: paths are relative to the top of the repository, with ./ to the current directory
         prefix = _git("rev-parse", "--show-prefix", environ=environ) if path.startswith(("./", "../")) else ""
-        commit = _git("rev-parse", "--verify", "--quiet", "--end-of-options", f"{revision}^{{commit}}", environ=environ)
+        commit = _commit(revision, environ)
+        if not commit:
+            raise InputError(f"{argument}: no revision '{revision}' in {top}", hint="`git log` lists revisions")
         _git("-C", top, "read-tree", commit, environ=environ)
         _git("-C", top, "checkout-index", "--all", f"--prefix={tree}/", environ=environ)
         # marks the root, so that includes stay within it
@@ -66,7 +63,22 @@ def checkout(argument: str) -> Iterator[InventoryCheckout]:
         inside = Path(os.path.normpath(tree / prefix / path))
         if not inside.exists() or not inside.is_relative_to(tree):
             raise InputError(f"{argument}: no such file or directory in {revision}")
-        yield InventoryCheckout(inside, f"{tree}/", f"{revision}:")
+        try:
+            yield InventoryCheckout(inside)
+        except InvalidInput as error:
+            root, label = f"{tree}/", f"{revision}:"
+            raise InvalidInput(
+                replace(item, position=replace(item.position, file=item.position.file.replace(root, label)))
+                for item in error.diagnostics
+            ) from error
+
+
+def _commit(revision: str, environ: dict[str, str]) -> str:
+    """The commit that git knows by this name; empty if there is none."""
+    try:
+        return _git("rev-parse", "--verify", "--quiet", "--end-of-options", f"{revision}^{{commit}}", environ=environ)
+    except InputError:
+        return ""
 
 
 def _git(*arguments: str, environ: dict[str, str]) -> str:

@@ -135,7 +135,9 @@ class _RootGroup(TyperGroup):
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         named = next((place for place, word in enumerate(args) if word in COMMANDS), 0)
         if named and args[0].startswith("-") and args[0] not in (*ctx.help_option_names, "--version"):
-            moved = ["meshctl", args[named], *args[:named], *args[named + 1 :]]
+            # behind the commands of a group, before the words of a command for nodes
+            end = args.index("--") if "--" in args else len(args)
+            moved = ["meshctl", *args[named:end], *args[:named], *args[end:]]
             raise InputError("options follow the command", hint=shlex.join(moved))
         return super().parse_args(ctx, args)
 

@@ -60,8 +60,11 @@ def test_an_unknown_command_is_a_usage_error_with_a_suggestion() -> None:
 
 
 def test_options_before_the_command_are_answered_with_the_right_order() -> None:
-    done = run("-v", "run", "b01")
-    assert (done.returncode, done.stderr) == (2, "error: options follow the command\nhint: meshctl run -v b01\n")
+    done = run("-v", "run", "b01", "--", "uptime")
+    expected = "error: options follow the command\nhint: meshctl run b01 -v -- uptime\n"
+    assert (done.returncode, done.stderr) == (2, expected)
+    # a group has no such option, its commands have
+    assert run("-i", "x", "inventory", "list").stderr.endswith("hint: meshctl inventory list -i x\n")
 
 
 @pytest.mark.parametrize(

@@ -230,7 +230,8 @@ class TestRevisions:
     @pytest.mark.parametrize(
         ("argument", "words"),
         [
-            ("nothing:fleet.yaml", "git rev-parse"),
+            ("nothing:fleet.yaml", "error: nothing:fleet.yaml: no revision 'nothing' in "),
+            ("HEAD", "hint: for a revision of git, add the path of the inventory in it, such as HEAD:./"),
             ("HEAD:gone.yaml", "no such file or directory in HEAD"),
             ("HEAD:../../etc/passwd", "no such file or directory in HEAD"),
         ],
@@ -246,3 +247,11 @@ class TestRevisions:
         ran = run("diff", "HEAD:fleet.yaml", repository)
         assert ran.code == 2
         assert "error: HEAD:fleet.yaml:" in ran.err
+
+    def test_what_cannot_be_rendered_is_reported_with_its_revision(self, run: Run, repository: Path) -> None:
+        # this release accepts RSA keys only
+        (repository / "fleet.yaml").write_text(INVENTORY.replace('release: "23.05"', 'release: "19.07"'))
+        self.commit(repository, "third")
+        ran = run("diff", "HEAD:fleet.yaml", repository)
+        assert ran.code == 2
+        assert ran.err.startswith("error: HEAD:fleet.yaml:4:")
