@@ -92,7 +92,7 @@ def export(
     if out is None:
         echo(text, nl=False)
     else:
-        write_file(out, text)
+        write_file(out, text, inventory=fleet.files)
 
 
 def _text(fleet: Fleet, format: ExportFormat, nodes: list[str] | None, limit: list[str] | None) -> str:
@@ -119,7 +119,7 @@ def _write_labels(
     if out is None:
         echo_bytes(content)
     else:
-        write_file(out, content)
+        write_file(out, content, inventory=fleet.files)
     unprintable = [each.name for each in found if not is_printable(each)]
     if unprintable:
         hint = "the sheet's fonts have Western European characters only; the code has name, MAC and key"

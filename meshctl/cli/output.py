@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import shutil
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -96,9 +96,11 @@ def lose_reader() -> None:
     discard_output()
 
 
-def write_file(path: Path, content: str | bytes) -> None:
-    """Write the file that an option names, such as `--out`. Raises InputError with the reason if that fails; an earlier
-    file then stays as it was."""
+def write_file(path: Path, content: str | bytes, *, inventory: Iterable[str] = ()) -> None:
+    """Write the file that an option names, such as `--out`. Raises InputError with the reason if that fails, or if it
+    is one of the inventory's; an earlier file then stays as it was."""
+    if os.path.realpath(path) in map(os.path.realpath, inventory):
+        raise InputError(f"{path} is a file of the inventory, and would be overwritten", hint="name another file")
     data = content.encode() if isinstance(content, str) else content
     try:
         if path.exists() and not path.is_file():

@@ -110,13 +110,13 @@ def plan(
         if sites:
             with closing(prepare_everywhere(opened, inventory, own, sites, choices)) as made:
                 if out is not None:
-                    write_file(out, dump_site_plans(made.saved(opened, choices)))
+                    write_file(out, dump_site_plans(made.saved(opened, choices)), inventory=opened.fleet.files)
                 raise typer.Exit(report_everywhere(opened, made, choices, as_json=as_json, brief=brief))
         opened = with_sent_states(opened)
         prepared = prepare_plan(opened, own, choices, reconnects=reconnect)
         hand_over(prepared)
         if out is not None:
-            write_file(out, dump(saved_plan(opened, prepared, choices)))
+            write_file(out, dump(saved_plan(opened, prepared, choices)), inventory=opened.fleet.files)
         raise typer.Exit(report_plan(opened, prepared, choices, as_json=as_json, brief=brief))
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner, Result
 
-from meshctl.cli.main import build
+from meshctl.cli.main import build, main
 from meshctl.diagnostics import InvalidInput
 from meshctl.inventory import edit, load_fleet
 from meshctl.inventory.codes import MAX_DIAGNOSTICS
@@ -41,6 +41,16 @@ def test_importing_an_unchanged_export_makes_no_edits() -> None:
     rows = read(write(fleet.nodes.values()), "boxes.csv")
     assert len(rows) == len(fleet.nodes)
     assert edits(rows, fleet, "boxes.csv") == ()
+
+
+def test_an_export_does_not_overwrite_the_inventory(inventory: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = inventory / "fleet.yaml"
+    before = file.read_bytes()
+    with pytest.raises(SystemExit) as ended:
+        main(["inventory", "export", "--format", "csv", "-i", str(inventory), "--out", str(file)])
+    assert ended.value.code == 2
+    assert f"error: {file} is a file of the inventory, and would be overwritten" in capsys.readouterr().err
+    assert file.read_bytes() == before
 
 
 def test_values_are_set_and_comments_stay(inventory: Path) -> None:
