@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
@@ -17,6 +18,8 @@ from meshctl.model.secret import SecretRef
 from meshctl.model.site import OWN_ADDRESS, NatsHub, Site, SshSettings
 from meshctl.model.thin import ThinLink, ThinPorts
 from meshctl.model.topic import Topic
+
+_SWITCHED_PORT = re.compile(r"eth\d+\.(?P<vlan>\d+)")
 
 
 class Role(Enum):
@@ -135,11 +138,16 @@ class Node:
 
     @property
     def unswitched_ports(self) -> tuple[str, ...]:
-        """Ports such as eth0.1 whose VLAN is on no switch in the inventory."""
+        """Ports such as eth0.1 whose VLAN is on no switch in the inventory. swconfig's switches are behind ethN; a DSA
+        port, such as lan4.63, needs no switch VLAN."""
         if "switch_vlan" in self.extra_uci.values():
             return ()
         vlans = {vlan for vlan, _ in self.hardware.switch_vlans}
-        return tuple(port for port in self.lan_ports if "." in port and port.rpartition(".")[2] not in vlans)
+        return tuple(
+            port
+            for port in self.lan_ports
+            if (found := _SWITCHED_PORT.fullmatch(port)) is not None and found["vlan"] not in vlans
+        )
 
     @property
     def mesh_interfaces(self) -> dict[str, str]:

@@ -28,6 +28,11 @@ def test_what_cannot_be_a_port_is_refused(ports: str, tmp_path: Path) -> None:
     assert finding.expected == "the name of one port such as eth0.1, without blanks; commas separate ports"
 
 
+@pytest.mark.parametrize("port", ["lan4.63", "lan1.20", "wan.7"])
+def test_a_vlan_of_a_dsa_port_needs_no_switch_vlan(port: str, tmp_path: Path) -> None:
+    assert _found(f"hardware: {{rocket: {{lan_ports: [{port}]}}}}", tmp_path) == []
+
+
 @pytest.mark.parametrize("port", ["eth0", "eth0.1", "lan1", "wan", "lan-x"])
 def test_ports_as_in_openwrt_are_accepted(port: str, tmp_path: Path) -> None:
     codes = {one.code for one in _found(f"hardware: {{rocket: {{lan_ports: [{port}]}}}}", tmp_path)}
