@@ -149,9 +149,15 @@ def prepare(
 
 def _returning(fleet: Fleet, away: Iterable[str], journal: Journal) -> dict[str, float]:
     """Until when (Unix time) unreachable nodes may roll back a change whose end no run has observed."""
+    ends = rollback_ends(fleet, journal)
+    return {name: ends[name] for name in away if name in ends}
+
+
+def rollback_ends(fleet: Fleet, journal: Journal) -> dict[str, float]:
+    """Node -> when (Unix time) it has rolled back its latest change at the latest, if no run has observed the end."""
     window_s = max((node.confirm_window_s for node in fleet.managed()), default=0)
-    started = journal.unconfirmed_changes(fleet.name)
-    return {name: started[name] + window_s + GRACE_AFTER_WINDOW_S for name in away if name in started}
+    started = journal.latest_unfinished(fleet.name, "apply")
+    return {name: began_s + window_s + GRACE_AFTER_WINDOW_S for name, began_s in started.items()}
 
 
 def _remember(journal: Journal, fleet: Fleet, observed: FleetObservation) -> None:

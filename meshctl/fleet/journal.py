@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from meshctl.errors import MeshctlError
 from meshctl.fleet.alarm_actions import AlarmExchange
@@ -227,9 +227,9 @@ class Journal:
         """Node -> when its first change started (Unix time) whose end no run has observed."""
         return self._unfinished(fleet, "MIN", "'apply', 'flash'")
 
-    def unconfirmed_changes(self, fleet: str) -> dict[str, float]:
-        """Node -> when its latest change of files started (Unix time) whose end no run has observed."""
-        return self._unfinished(fleet, "MAX", "'apply'")
+    def latest_unfinished(self, fleet: str, step: Literal["apply", "flash"]) -> dict[str, float]:
+        """Node -> when its latest step of this kind started (Unix time) whose end no run has observed."""
+        return self._unfinished(fleet, "MAX", f"'{step}'")
 
     def _unfinished(self, fleet: str, pick: str, steps: str) -> dict[str, float]:
         ended = ", ".join(f"'{result.value}'" for result in Result if result not in _END_UNKNOWN)

@@ -38,6 +38,7 @@ from meshctl.status.assess import Snapshot
 from meshctl.status.emergency_stop import StopPlan, StopResult, send
 from meshctl.status.last_known import merge_by_device
 from meshctl.status.pings import Pings, ping, pings_of
+from meshctl.status.unfinished_changes import waiting_hints
 from meshctl.status.unreachable import NOT_ASKED, no_answer_of
 from meshctl.status.values import NoAnswer
 
@@ -120,6 +121,10 @@ class Collector:
                 no_answer[kind][name] = no_answer_of(answer)
             elif isinstance(answer, NoAnswer):
                 no_answer[kind][name] = answer
+        if no_answer["node"]:
+            for name, hint in waiting_hints(self.fleet, self.journal, self.clock()).items():
+                if name in no_answer["node"]:
+                    no_answer["node"][name] = replace(no_answer["node"][name], wait_for=hint)
         # a report is made of all paths that a node knows: once
         reports = reports_of(observations)
         self.journal.remember_all(

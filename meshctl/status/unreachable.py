@@ -68,9 +68,12 @@ def no_answer_alarm(
         return Alarm(Level.ERROR, why.code, why.reason, hints.get(why.code, why.hint))
     if not is_required:
         # on and in range of others, but without an answer: check it before it is dropped
-        hint = "wait a minute for it to boot, then check its address and cable"
+        hint = why.wait_for or "wait a minute for it to boot, then check its address and cable"
         return Alarm(Level.WARNING, "mute", f"{why.reason}, but {sighting}", hint) if sighting else None
     last_answer = f"last answered {duration(now - last.seen_s)} ago" if last else "never answered"
+    if why.wait_for:
+        text = f"{why.reason}; {last_answer}; {sighting or 'no node hears it'}"
+        return Alarm(Level.ERROR, "unreachable", text, why.wait_for)
     if sighting:
         hint = "it is on and in range: wait a minute, then run meshctl provision; if that fails, keep it off for 2 min"
         return Alarm(Level.ERROR, "unreachable", f"{why.reason}; {last_answer}; {sighting}", hint)

@@ -58,12 +58,13 @@ def health_of(alarms: Iterable[Alarm]) -> Health:
 class NoAnswer:
     """Why a device gave no answer. `code` is `unreachable`, or why a device that is on could not be queried:
     `host-key`, `untrusted`, `login` or `failed`. `of_gateway`: the gateway of its site failed, so nothing is
-    known about the device."""
+    known about the device. `wait_for`: the hint for a device that is still being changed."""
 
     reason: str
     code: str = "unreachable"
     hint: str = ""
     of_gateway: bool = False
+    wait_for: str = ""
 
 
 @dataclass(frozen=True, slots=True)

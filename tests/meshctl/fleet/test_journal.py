@@ -81,7 +81,8 @@ def test_a_change_is_unfinished_from_its_start_until_a_run_reaches_its_node_agai
                 pass
         assert journal.unfinished_changes("f")["a"] == lost["a"]
         # a flash is not rolled back
-        assert journal.unconfirmed_changes("f") == {"a": journal.steps(fourth.id, "a")[0].began_s}
+        assert journal.latest_unfinished("f", "apply") == {"a": journal.steps(fourth.id, "a")[0].began_s}
+        assert journal.latest_unfinished("f", "flash") == {"b": journal.steps(fourth.id, "b")[0].began_s}
         fourth.finish_node(Outcome("b", Result.DONE))
         third = journal.begin("provision", fleet="f", inventory="inv", nodes=("a",))
         third.finish_node(Outcome("a", Result.UNCHANGED))
