@@ -61,6 +61,8 @@ _ZLIB_LEVEL = 1
 
 Revision = tuple[int, float | None]
 
+_LISTED = "`meshctl alarms list --all` lists them"
+
 
 class FrameStore:
     """The open history. Safe for several threads; one process appends, others may read, acknowledge and silence.
@@ -328,7 +330,7 @@ class FrameStore:
         """Note that someone takes care of an open alarm. Raises InputError if none is open."""
         action = AlarmAction(AlarmActionKind.ACKNOWLEDGE, device, code, by, now_s)
         if not self.apply(action):
-            raise InputError(f"{device or 'the fleet'} has no open alarm {code}", hint="meshctl alarms lists them")
+            raise InputError(f"{device or 'the fleet'} has no open alarm {code}", hint=_LISTED)
         self.on_action(action)
 
     def silence(self, device: str, code: str, silence: Silence, now_s: float) -> None:
@@ -337,7 +339,8 @@ class FrameStore:
         if not silence.reason.strip():
             raise InputError("expected a reason for the silence")
         if device not in (ANY, FLEET) and not self._knows(device):
-            raise InputError(f"unknown device {device!r}", hint="meshctl alarms lists them; robot:NAME is a computer")
+            hint = "`meshctl inventory list` lists radios; robot:NAME is a computer"
+            raise InputError(f"unknown device {device!r}", hint=hint)
         action = AlarmAction(AlarmActionKind.SILENCE, device, code, silence.by, now_s, silence.until_s, silence.reason)
         self.apply(action)
         self.on_action(action)
@@ -356,7 +359,7 @@ class FrameStore:
         """Raises InputError if there is none."""
         action = AlarmAction(AlarmActionKind.END_SILENCE, device, code, by, now_s)
         if not self.apply(action):
-            raise InputError(f"{device or 'the fleet'} has no silence of {code}", hint="meshctl alarms lists them")
+            raise InputError(f"{device or 'the fleet'} has no silence of {code}", hint=_LISTED)
         self.on_action(action)
 
     def _newest_ms(self) -> int | None:
