@@ -44,6 +44,7 @@ from meshctl.cli.context import (
     session,
 )
 from meshctl.cli.journaled_run import JournaledRun, journaled_run, print_totals, retry_hint, run_context
+from meshctl.cli.node_completion import complete_node
 from meshctl.cli.output import echo, echo_json
 from meshctl.cli.plan import Yes
 from meshctl.cli.plan_execution import PlanRefused
@@ -122,7 +123,7 @@ def _write_private(path: Path, data: bytes) -> None:
 
 
 def restore(
-    node: Annotated[str, typer.Argument(help="Node to restore.")],
+    node: Annotated[str, typer.Argument(help="Node to restore.", autocompletion=complete_node)],
     file: Annotated[Path, typer.Argument(help="Backup written by `meshctl backup`.")],
     inventory: InventoryPath = Path(),
     keep_radios: Annotated[

@@ -1,4 +1,4 @@
-"""Where devices are on a bench: the options `--at`, `--interface` and `--at-site`."""
+"""Where devices are on a bench, and which are expected there: the options `--at`, `--interface` and `--at-site`."""
 
 from __future__ import annotations
 
@@ -11,9 +11,18 @@ import typer
 
 from meshctl.apply.bootstrap import FACTORY_ADDRESS, BenchTarget
 from meshctl.cli.extensions import LabFleet
+from meshctl.cli.node_completion import complete_nodes
 from meshctl.errors import InputError
 from meshctl.model import Fleet, Node
 from meshctl.suggest import did_you_mean
+
+ExpectedNodes = Annotated[
+    list[str] | None,
+    typer.Argument(
+        help="Expected nodes: names, labels, serial numbers, MACs, patterns, groups; default: identify by MAC.",
+        autocompletion=complete_nodes,
+    ),
+]
 
 At = Annotated[
     list[str] | None,

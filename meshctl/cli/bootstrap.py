@@ -34,6 +34,7 @@ from meshctl.apply.replace import (
 from meshctl.cli.bench_places import (
     At,
     AtSite,
+    ExpectedNodes,
     Interfaces,
     named_places,
     no_answer_hint,
@@ -54,6 +55,7 @@ from meshctl.cli.context import (
     session,
 )
 from meshctl.cli.fleet_view import site_observer
+from meshctl.cli.node_completion import complete_node
 from meshctl.cli.output import echo, echo_error
 from meshctl.cli.plan import Brief, NoFirmware, Rate, Yes
 from meshctl.cli.plan_execution import SALT_BYTES, confirm_and_execute
@@ -74,12 +76,7 @@ BENCH = "bench"
 
 
 def bootstrap(
-    nodes: Annotated[
-        list[str] | None,
-        typer.Argument(
-            help="Expected nodes: names, labels, serial numbers, MACs, patterns, groups; default: identify by MAC."
-        ),
-    ] = None,
+    nodes: ExpectedNodes = None,
     limit: Limit = None,
     at: At = None,
     interface: Interfaces = None,
@@ -197,7 +194,7 @@ def _expected_places(opened: Session, words: list[str], limits: list[str], at: l
 
 
 def replace(
-    old: Annotated[str, typer.Argument(help="Node whose device failed or is lost.")],
+    old: Annotated[str, typer.Argument(help="Node whose device failed or is lost.", autocompletion=complete_node)],
     new: Annotated[str, typer.Argument(help="Spare node, or `bench` for a device that is not in the inventory.")],
     at: Annotated[
         str,

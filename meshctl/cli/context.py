@@ -23,6 +23,7 @@ import typer
 
 from meshctl import event_log
 from meshctl.cli.extensions import LabFleet, attach_lab
+from meshctl.cli.node_completion import complete_node, complete_nodes
 from meshctl.cli.output import console, echo, echo_error
 from meshctl.errors import ExitCode, InputError, MeshctlError
 from meshctl.fleet import Interrupt, Outcome, totals
@@ -61,7 +62,9 @@ Lab = Annotated[
 ]
 Nodes = Annotated[
     list[str] | None,
-    typer.Argument(help="Nodes: names, patterns, groups, role:beacon, '!b07', @FILE; default: all."),
+    typer.Argument(
+        help="Nodes: names, patterns, groups, role:beacon, '!b07', @FILE; default: all.", autocompletion=complete_nodes
+    ),
 ]
 Limit = Annotated[
     list[str] | None,
@@ -70,7 +73,13 @@ Limit = Annotated[
         "-l",
         metavar="NODES",
         help="Narrow the selection to nodes that match this, too; repeatable.",
+        autocompletion=complete_nodes,
     ),
+]
+
+OneNode = Annotated[
+    str,
+    typer.Argument(help="The node: name, label, serial number or MAC.", autocompletion=complete_node),
 ]
 
 DryRun = Annotated[bool, typer.Option("--dry-run", help="Show what would change, and change nothing.")]

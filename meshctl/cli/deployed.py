@@ -14,6 +14,7 @@ from typing import Annotated, NoReturn
 import typer
 
 from meshctl.cli.context import InventoryPath, KeyFiles, Lab, Limit, read_selection
+from meshctl.cli.node_completion import complete_nodes
 from meshctl.cli.output import echo
 from meshctl.errors import InputError
 from meshctl.inventory.edit import Editor, save, set_state
@@ -25,7 +26,9 @@ from meshctl.model import Fleet, Node, NodeState, Role
 def deployed(
     beacons: Annotated[
         list[str] | None,
-        typer.Argument(help="Beacons: names, labels, patterns, groups, robot:husky1, '!b07', @FILE."),
+        typer.Argument(
+            help="Beacons: names, labels, patterns, groups, robot:husky1, '!b07', @FILE.", autocompletion=complete_nodes
+        ),
     ] = None,
     limit: Limit = None,
     inventory: InventoryPath = Path(),

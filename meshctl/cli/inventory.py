@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import typer
 
 from meshctl.cli.command_group import ImportGroup
-from meshctl.cli.context import AsJson, InventoryPath, Limit, Nodes, selected_node, selected_nodes
+from meshctl.cli.context import AsJson, InventoryPath, Limit, Nodes, OneNode, selected_node, selected_nodes
 from meshctl.cli.export import export
 from meshctl.cli.inventory_import import app as import_app
 from meshctl.cli.output import echo, echo_json, terminal_width, write_file
@@ -100,7 +100,7 @@ def list_nodes(
 
 @app.command("show")
 def show(
-    node: Annotated[str, typer.Argument(help="The node: name, label, serial number or MAC.")],
+    node: OneNode,
     inventory: InventoryPath = Path(),
     why: Annotated[bool, typer.Option("--why", help="Show the layer, file and line of each value.")] = False,
     as_json: AsJson = False,
@@ -123,7 +123,7 @@ def show(
 
 @app.command("state")
 def change_state(
-    node: Annotated[str, typer.Argument(help="The node: name, label, serial number or MAC.")],
+    node: OneNode,
     new: Annotated[NodeState, typer.Argument(help="New state.")],
     inventory: InventoryPath = Path(),
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the change without writing it.")] = False,

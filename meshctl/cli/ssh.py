@@ -22,6 +22,7 @@ from meshctl.cli.context import (
     Lab,
     Limit,
     Nodes,
+    OneNode,
     Session,
     exit_for,
     selected_node,
@@ -192,7 +193,7 @@ def _print(name: str, stdout: str, stderr: str, *, as_json: bool, status: int) -
 
 
 def ssh(
-    node: Annotated[str, typer.Argument(help="The node: name, label, serial number or MAC.")],
+    node: OneNode,
     command: Annotated[list[str] | None, typer.Argument(help="After --: command to run instead of a shell.")] = None,
     inventory: InventoryPath = Path(),
     key: KeyFiles = None,

@@ -17,6 +17,7 @@ import typer
 from meshctl.cli.context import AsJson, Limit, confirm, line_width, read_selection
 from meshctl.cli.fleet_view import FleetView, collect, paint_of, with_fleet_view
 from meshctl.cli.live_screen import live_screen
+from meshctl.cli.node_completion import complete_nodes
 from meshctl.cli.output import echo, echo_json
 from meshctl.errors import ExitCode, InputError
 from meshctl.status import Check, FleetStatus, assess
@@ -35,6 +36,7 @@ Names = Annotated[
     typer.Argument(
         metavar="NAME",
         help="Radios and robots: names, patterns, groups, role:beacon, '!b07', @FILE; default: all.",
+        autocompletion=complete_nodes,
     ),
 ]
 

@@ -19,6 +19,7 @@ from meshctl.cli import main as root
 from meshctl.cli.commands import COMMANDS
 from meshctl.errors import InputError
 from meshctl.inventory.starter import write_starter
+from meshctl.resources import shipped
 
 
 def run(*arguments: str, **environ: str) -> subprocess.CompletedProcess[str]:
@@ -151,6 +152,23 @@ def test_every_command_that_asks_before_a_change_has_a_dry_run() -> None:
 def test_completion_offers_the_commands(tmp_path: Path) -> None:
     done = run(_MESHCTL_COMPLETE="complete_bash", COMP_WORDS="meshctl li", COMP_CWORD="1")
     assert "lint" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        ("meshctl status -i FLEET rover1-b0", [f"rover1-b0{number}" for number in range(1, 7)]),
+        ("meshctl inventory state -i FLEET ba", ["base"]),
+        ("meshctl plan -i FLEET base,rover1-r", ["base,rover1-radio"]),
+        ("meshctl provision -i FLEET --limit !ba", ["!base"]),
+        ("meshctl status -i /nowhere b", []),
+    ],
+)
+def test_completion_offers_the_nodes_of_the_inventory(words: str, expected: list[str]) -> None:
+    typed = words.replace("FLEET", str(shipped("inventory") / "starter"))
+    number = str(len(typed.split()) - 1)
+    done = run(_MESHCTL_COMPLETE="complete_bash", COMP_WORDS=typed, COMP_CWORD=number)
+    assert (done.stdout.split(), done.stderr) == (expected, "")
 
 
 def test_an_error_is_one_message_with_its_hint_and_exit_code(
