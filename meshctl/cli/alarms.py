@@ -38,7 +38,9 @@ By = Annotated[str | None, typer.Option("--by", help="Operator to record; defaul
 
 
 @contextmanager
-def _history(inventory: Path, lab: Path | None, store: Path | None) -> Iterator[FrameStore]:
+def _history(
+    inventory: Path, lab: Path | None, store: Path | None, *, changes_nothing: bool = False
+) -> Iterator[FrameStore]:
     if store is not None:
         with FrameStore.open_running(store) as opened:
             yield opened
@@ -49,7 +51,9 @@ def _history(inventory: Path, lab: Path | None, store: Path | None) -> Iterator[
     fleet = load_fleet(inventory, environ=os.environ).name
     with (
         FrameStore.open_running(history_path(fleet, lab)) as opened,
-        open_journal(os.environ, echo_error, lab="" if lab is None else str(lab)) as journal,
+        open_journal(
+            os.environ, echo_error, lab="" if lab is None else str(lab), changes_nothing=changes_nothing
+        ) as journal,
     ):
         if (exchange := journal.alarm_exchange(fleet)) is not None:
             opened.on_action = exchange.send
@@ -70,7 +74,7 @@ def list_alarms(
 
     Example: meshctl alarms list --all
     """
-    with _history(inventory, lab, store) as history:
+    with _history(inventory, lab, store, changes_nothing=True) as history:
         now_s = time.time()
         found = history.alarms(active_only=not include_all, now_s=now_s)
         frame = history.latest()

@@ -52,9 +52,9 @@ from meshctl.device.observation import Observation
 from meshctl.errors import InputError
 from meshctl.fleet import Outcome, Result, run
 from meshctl.model import Node
-from meshctl.nodes.collect import facts_of
+from meshctl.nodes.collect import collect, facts_of
 from meshctl.nodes.dead_changes import observe_cleared
-from meshctl.nodes.slots import transfers_at_once
+from meshctl.nodes.slots import nodes_in_work, transfers_at_once
 from meshctl.plan import Cut, Effect, NodePlan, Verdict
 from meshctl.wording import counted
 
@@ -78,7 +78,7 @@ def backup(
 
     Example: meshctl backup 'husky*' --out backups
     """
-    with session(inventory, key_files=key or (), lab=lab) as opened:
+    with session(inventory, key_files=key or (), lab=lab, changes_nothing=True) as opened:
         selected = {node.name: node for node in selected_nodes(opened.fleet, nodes, limit)}
         try:
             out.mkdir(parents=True, exist_ok=True, mode=0o700)
@@ -87,7 +87,7 @@ def backup(
 
         def work(name: str) -> Outcome:
             with opened.access.borrow(selected[name]) as connection:
-                observation = observe_cleared(connection, (), opened.interrupt)
+                observation = seen.get(name) or observe_cleared(connection, (), opened.interrupt)
                 data = fetch(connection, name, observation)
             path = out / f"{name}-{time.strftime('%Y%m%dT%H%M%SZ', time.gmtime(observation.answered_at_s))}.tgz"
             _write_private(path, data)
@@ -98,6 +98,9 @@ def backup(
             progress_for(len(selected), as_json=as_json) as progress,
             opened.interrupt.on_signals(progress.stopping),
         ):
+            # of all before the first transfer: changes of a killed meshctl end in the order that keeps nodes reachable
+            parallel = nodes_in_work(opened.fleet.apply.parallel)
+            seen = collect(opened.access, selected.values(), parallel=parallel, interrupt=opened.interrupt).observations
             ended = run(
                 selected,
                 work,

@@ -16,7 +16,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryFile
-from types import TracebackType
+from types import MappingProxyType, TracebackType
 from typing import Any, Self
 
 from cryptography.hazmat.primitives import serialization
@@ -211,9 +211,16 @@ class Rig:
             text=True,
         )
 
-    def meshctl(self, verb: str, variant: str, *words: str, command: Sequence[str] = ()) -> Ended:
-        """Run it to its end."""
-        return run(self._words(verb, variant, words, command), self.environ)
+    def meshctl(
+        self,
+        verb: str,
+        variant: str,
+        *words: str,
+        command: Sequence[str] = (),
+        environ: Mapping[str, str] = MappingProxyType({}),
+    ) -> Ended:
+        """Run it to its end; `environ` are further variables."""
+        return run(self._words(verb, variant, words, command), {**self.environ, **environ})
 
     def _words(self, verb: str, variant: str, words: Sequence[str], command: Sequence[str]) -> list[str]:
         return [
