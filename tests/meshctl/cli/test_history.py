@@ -63,6 +63,7 @@ def test_a_run_is_wrapped_at_the_width_of_the_terminal(
 def test_what_a_run_did_not_change_is_not_called_changed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
+    monkeypatch.setenv("COLUMNS", "120")
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
     diff = "--- a\n+++ b\n@@ -1 +1 @@\n-config radio\n+config wifi-device\n"
     with Journal(tmp_path / "meshctl" / "journal.sqlite") as journal:
