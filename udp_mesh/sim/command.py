@@ -17,6 +17,7 @@ from udp_mesh.sim.run import RunResult, play
 from udp_mesh.sim.scenario import MAX_DURATION_S, Scenario, ScenarioError, load
 
 SHIPPED = Path(__file__).with_name("scenarios")
+NO_SCENARIO = "expected a scenario, found none; `udp-mesh sim --list` lists the shipped ones"
 
 
 def run_command(arguments: Sequence[str]) -> int:
@@ -40,10 +41,12 @@ def run_command(arguments: Sequence[str]) -> int:
     )
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
     options = parser.parse_args(list(arguments))
-    if options.list or options.scenario is None:
+    if options.list:
         print(*shipped(), sep="\n")
-        return 0 if options.list else 2
+        return 0
     try:
+        if options.scenario is None:
+            raise ScenarioError(NO_SCENARIO)
         scenario = load(find(options.scenario))
         if options.seed is not None:
             scenario = replace(scenario, seed=options.seed)

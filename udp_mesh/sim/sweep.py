@@ -20,7 +20,7 @@ from mesh_sweep.errors import SweepError
 from mesh_sweep.results import Identity
 from mesh_sweep.revision import check_worker, source_revision
 from mesh_sweep.scenario_text import EditedText, fingerprint, with_settings
-from udp_mesh.sim.command import find
+from udp_mesh.sim.command import NO_SCENARIO, find
 from udp_mesh.sim.run import play
 from udp_mesh.sim.scenario import Scenario, ScenarioError, parse
 
@@ -113,7 +113,7 @@ def run_sweep(arguments: Sequence[str]) -> int:
         if options.show is not None:
             return show(options.show, given, SHOWN)
         if options.scenario is None:
-            raise SweepError("expected a scenario, found none; `udp-mesh sim --list` lists the shipped ones")
+            raise SweepError(NO_SCENARIO)
         return sweep(study_of(find(options.scenario)), given, SHORT)
     except (SweepError, ScenarioError) as error:
         sys.stderr.write("".join(f"udp-mesh: {problem}\n" for problem in str(error).splitlines()))

@@ -151,3 +151,10 @@ def test_an_alias_is_refused() -> None:
 def test_a_missing_file_is_an_error_and_exit_code_2(capsys: pytest.CaptureFixture[str]) -> None:
     assert run_command(["no-such-scenario"]) == 2
     assert "expected a file or one of" in capsys.readouterr().err
+
+
+def test_no_scenario_is_an_error_that_says_where_the_names_are(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_command([]) == 2
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert printed.err == "udp-mesh: expected a scenario, found none; `udp-mesh sim --list` lists the shipped ones\n"
