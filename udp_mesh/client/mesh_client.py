@@ -171,7 +171,9 @@ class MeshClient:
         # that hangs, which with a timeout of Python's fails at once if others are connecting.
         self._socket.settimeout(None)
         timeout = divmod(int(1e6 * min(max(timeout_s, 0.001), 1e6)), 1_000_000)
-        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, _TIMEVAL.pack(*timeout))
+        # A 32-bit system with 64-bit times expects another structure: it has no timeout then.
+        with contextlib.suppress(OSError):
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, _TIMEVAL.pack(*timeout))
         try:
             self._socket.connect(path)
         except OSError as error:
