@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 
 from tests.udp_mesh.core.relaying.topologies import KEY
-from tests.udp_mesh.core.test_broadcast import Disk
+from tests.udp_mesh.disk import Disk
 from udp_mesh.core.endpoint import Endpoint
 from udp_mesh.core.events import (
     Event,

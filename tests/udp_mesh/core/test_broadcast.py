@@ -8,6 +8,7 @@ from collections.abc import Callable
 import pytest
 
 from tests.udp_mesh.core.pair import BROADCAST, World, pair, settings
+from tests.udp_mesh.disk import Disk
 from udp_mesh.core.broadcast import MAX_MISSING, NackRepair
 from udp_mesh.core.events import (
     ExpiryReason,
@@ -19,7 +20,7 @@ from udp_mesh.core.events import (
     Rejected,
     RejectReason,
 )
-from udp_mesh.core.interfaces import Datagram, StoredMessage
+from udp_mesh.core.interfaces import Datagram
 from udp_mesh.core.ranges import RangeSet
 from udp_mesh.core.settings import Outbox, Rates, Topic
 
@@ -162,26 +163,6 @@ def test_a_full_outbox_drops_the_oldest_messages() -> None:
     out_of_reach(world, up=True)
     world.run(10.0)
     assert [payload[0] for payload in payloads(world, "b")] == [2, 3]
-
-
-class Disk:
-    """A store in memory that outlives nodes."""
-
-    def __init__(self) -> None:
-        self.kept: dict[int, StoredMessage] = {}
-
-    def put(self, message: StoredMessage) -> bool:
-        self.kept[message.key] = message
-        return True
-
-    def holds(self, key: int) -> bool:
-        return key in self.kept
-
-    def remove(self, key: int) -> None:
-        self.kept.pop(key, None)
-
-    def load(self) -> list[StoredMessage]:
-        return [self.kept[key] for key in sorted(self.kept)]
 
 
 def test_an_outbox_on_disk_survives_a_restart_until_its_messages_are_delivered() -> None:

@@ -6,7 +6,7 @@ from types import FrameType
 import pytest
 
 from tests.udp_mesh.core.pair import World, settings
-from tests.udp_mesh.core.test_broadcast import Disk
+from tests.udp_mesh.disk import Disk
 from udp_mesh.core.events import (
     ExpiryReason,
     MessageDelivered,

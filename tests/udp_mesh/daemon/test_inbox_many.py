@@ -13,6 +13,7 @@ from typing import Any, cast
 
 import pytest
 
+from tests.udp_mesh.disk import Disk
 from udp_mesh.core.events import MessageReceived, Receipt
 from udp_mesh.core.interfaces import StoredMessage
 from udp_mesh.daemon.api import Client
@@ -23,20 +24,10 @@ from udp_mesh.daemon.subscriptions import Subscriptions
 MANY = 1000
 
 
-class Disk:
-    """A disk that takes everything at once."""
+class QuickDisk(Disk):
+    """A disk that takes everything at once. What it does not have cannot be removed."""
 
     needs_flush = True
-
-    def __init__(self) -> None:
-        self.kept: dict[int, StoredMessage] = {}
-
-    def put(self, message: StoredMessage) -> bool:
-        self.kept[message.key] = message
-        return True
-
-    def holds(self, key: int) -> bool:
-        return key in self.kept
 
     def remove(self, key: int) -> None:
         del self.kept[key]
@@ -73,7 +64,7 @@ class Program:
 
 class Robot:
     def __init__(self) -> None:
-        self.disk = Disk()
+        self.disk = QuickDisk()
         self.confirmed: list[Receipt] = []
         self.inbox = Inbox(cast(DirectoryStore, self.disk), self.confirmed.append, lambda _: None)
         self._tasks: set[asyncio.Task[None]] = set()

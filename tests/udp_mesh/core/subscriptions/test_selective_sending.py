@@ -9,7 +9,7 @@ import pytest
 
 from tests.udp_mesh.core.pair import Pipe, World, settings
 from tests.udp_mesh.core.subscriptions.team import TOPICS, config, met, outcomes, read, received
-from tests.udp_mesh.core.test_broadcast import Disk
+from tests.udp_mesh.disk import Disk
 from udp_mesh.core.events import (
     ExpiryReason,
     MessageDelivered,
