@@ -11,31 +11,20 @@ import subprocess
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 from meshctl.diagnostics import InvalidInput
 from meshctl.errors import InputError
-from meshctl.inventory import load_fleet
-from meshctl.model import Fleet
 
 # a local repository answers at once; a longer wait is a hang
 _GIT_TIMEOUT_S = 120
 
 
-@dataclass(frozen=True, slots=True)
-class InventoryCheckout:
-    """`path` is readable within the context of `checkout`."""
-
-    path: Path
-
-    def fleet(self) -> Fleet:
-        return load_fleet(self.path, environ=os.environ)
-
-
 @contextmanager
-def checkout(argument: str) -> Iterator[InventoryCheckout]:
-    """The inventory at `argument`; an existing path wins over a revision. Raises InputError if there is none.
+def checkout(argument: str) -> Iterator[Path]:
+    """The inventory at `argument`, readable within the context; an existing path wins over a revision. Raises
+    InputError if there is none.
 
     Errors of the inventory that are raised within the context have positions in the revision.
     """
@@ -44,7 +33,7 @@ def checkout(argument: str) -> Iterator[InventoryCheckout]:
         if not Path(argument).exists() and _commit(argument, dict(os.environ)):
             hint = f"for a revision of git, add the path of the inventory in it, such as {argument}:./"
             raise InputError(f"{argument}: no such file or directory", hint=hint)
-        yield InventoryCheckout(Path(argument))
+        yield Path(argument)
         return
     with tempfile.TemporaryDirectory(prefix="meshctl-diff-") as folder:
         tree = Path(folder) / "tree"
@@ -64,7 +53,7 @@ def checkout(argument: str) -> Iterator[InventoryCheckout]:
         if not inside.exists() or not inside.is_relative_to(tree):
             raise InputError(f"{argument}: no such file or directory in {revision}")
         try:
-            yield InventoryCheckout(inside)
+            yield inside
         except InvalidInput as error:
             root, label = f"{tree}/", f"{revision}:"
             raise InvalidInput(

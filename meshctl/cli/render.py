@@ -136,7 +136,7 @@ def diff(
     Example: meshctl diff HEAD~1:inventory/subt-final inventory/subt-final
     """
     with checkout(before) as old, checkout(str(inventory) if after is None else after) as new:
-        differences = list(compare_fleets(old.fleet(), new.fleet()))
+        differences = list(compare_fleets(load_fleet(old, environ=os.environ), load_fleet(new, environ=os.environ)))
     if as_json:
         echo_json(json.dumps({"nodes": [_as_json(item) for item in differences]}, indent=2, ensure_ascii=False))
     else:
