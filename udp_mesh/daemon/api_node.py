@@ -34,6 +34,7 @@ from udp_mesh.core.events import (
 )
 from udp_mesh.core.setting_checks import check_items, check_type
 from udp_mesh.core.settings import Settings
+from udp_mesh.daemon.directory_lock import DirectoryLock
 from udp_mesh.daemon.driver import Driver
 from udp_mesh.daemon.interface import POSITION_TOPIC
 from udp_mesh.daemon.outbox import DirectoryStore
@@ -73,6 +74,7 @@ class Node:
         self._links = tuple(links)
         self._store = store
         self._urgent_dscp = urgent_dscp
+        self._store_lock: DirectoryLock | None = None
         self._driver: Driver | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
         self._messages = UnreadMessages(self._confirm, self._postpone)
@@ -80,8 +82,8 @@ class Node:
         self._outcomes: dict[tuple[MessageId, str], asyncio.Future[Outcome]] = {}
 
     async def __aenter__(self) -> Node:
-        """Opens the links. Raises OSError if the kernel cannot list its interfaces, and RuntimeError in a node that is
-        running already."""
+        """Opens the links. Raises OSError if the kernel cannot list its interfaces, or another node or process uses the
+        directory of the store, and RuntimeError in a node that is running already."""
         if self._driver is not None and not self._driver.closed:
             raise RuntimeError("the node is running already: use another `Node` for a second one")
         self._loop = asyncio.get_running_loop()
@@ -89,33 +91,42 @@ class Node:
             # The run before was in another loop, perhaps. Its senders send again what was not read then.
             self._messages = UnreadMessages(self._confirm, self._postpone)
             self._events, self._outcomes = Unread(), {}
-        self._driver = Driver(
-            self._settings,
-            self._links,
-            boot_id=os.urandom(BOOT_ID_BYTES),
-            rng=random.SystemRandom(),
-            on_event=self._event,
-            store=self._store,
-            urgent_dscp=self._urgent_dscp,
-        )
+        self._store_lock = None if self._store is None else self._store.lock()
         try:
+            self._driver = Driver(
+                self._settings,
+                self._links,
+                boot_id=os.urandom(BOOT_ID_BYTES),
+                rng=random.SystemRandom(),
+                on_event=self._event,
+                store=self._store,
+                urgent_dscp=self._urgent_dscp,
+            )
             self._driver.start()
         except BaseException:
             # without an `async with` block, nothing else closes its sockets and timers
-            self._driver.close()
+            self._close()
             raise
         return self
 
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self.driver.close()
+        self._close()
         for future in self._outcomes.values():
             if not future.done():
                 # Messages that wait on disk have no outcome yet.
                 future.set_exception(RuntimeError("the node was closed before the outcome of the message was known"))
         self._messages.close()
         self._events.close()
+
+    def _close(self) -> None:
+        try:
+            if self._driver is not None:
+                self._driver.close()
+        finally:
+            if self._store_lock is not None:
+                self._store_lock.release()
 
     @property
     def messages_dropped(self) -> int:

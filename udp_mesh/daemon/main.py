@@ -1,6 +1,6 @@
 """The daemon from start to stop.
 
-1. Opens the links, the local socket and the metrics port, then drops privileges.
+1. Locks the state directory, opens the links, the local socket and the metrics port, then drops privileges.
 2. Notifies systemd that the service is ready, then sends a watchdog keep-alive twice per period.
 3. On SIGHUP, reads the configuration again; on SIGTERM or SIGINT, sends goodbyes, closes its files and exits.
 """
@@ -20,6 +20,7 @@ from typing import Any
 from udp_mesh.daemon.api import LocalServer, RequestError
 from udp_mesh.daemon.commands import COMMANDS, render_metrics
 from udp_mesh.daemon.configuration import Configuration, load
+from udp_mesh.daemon.directory_lock import DirectoryLock
 from udp_mesh.daemon.file_access import FILE_TIMEOUT_S, off_loop
 from udp_mesh.daemon.heap import map_large_blocks
 from udp_mesh.daemon.listener import check_unused
@@ -39,8 +40,19 @@ GC_THRESHOLDS = (20_000, 50, 50)
 async def run(configuration: Configuration) -> None:
     """Runs the daemon until SIGTERM or SIGINT. Raises OSError if it cannot start."""
     map_large_blocks()
-    # before it reads the state directory: that may be the other daemon's, which is writing there
+    # both before it reads the state directory: that may be the other daemon's, which is writing there
     check_unused(configuration.daemon.socket)
+    try:
+        lock = DirectoryLock(configuration.daemon.state_directory)
+    except OSError as error:
+        raise OSError(f"{error} (change `state_directory` in [daemon])") from None
+    try:
+        await _run(configuration)
+    finally:
+        lock.release()
+
+
+async def _run(configuration: Configuration) -> None:
     if configuration.settings.unkeyed:
         log.warning("UNKEYED traffic is not protected: anyone on the network can read, forge and inject messages")
     service = Service(configuration, boot_id=os.urandom(BOOT_ID_BYTES), rng=random.SystemRandom(), wall_clock=time.time)

@@ -25,6 +25,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
 from udp_mesh.core.interfaces import StoredMessage
+from udp_mesh.daemon.directory_lock import DirectoryLock
 
 log = logging.getLogger(__name__)
 
@@ -33,6 +34,7 @@ LOG_AGAIN_S = 60.0
 """Minimum interval between two log lines about a full disk."""
 REMOVE_AGAIN_S = 5.0
 """Interval between attempts to remove files that a read-only or broken disk kept: a restart would send them again."""
+DIRECTORY_MODE = 0o700
 _CHECKSUM_BYTES = 8
 
 
@@ -64,6 +66,10 @@ class DirectoryStore:
         self._removal_timer: threading.Timer | None = None
         self._disk = ThreadPoolExecutor(max_workers=1, thread_name_prefix="outbox")
 
+    def lock(self) -> DirectoryLock:
+        """Creates and locks the directory. Raises OSError if another process or store has locked it."""
+        return DirectoryLock(self._directory, mode=DIRECTORY_MODE)
+
     def check_writable(self) -> None:
         """Reports an unusable directory now rather than with the first message."""
         self._disk.submit(self._check_writable)
@@ -77,7 +83,7 @@ class DirectoryStore:
             log.error("outbox-unusable directory=%s error=%s", self._directory, error)
 
     def _make_directory(self) -> None:
-        self._directory.mkdir(parents=True, exist_ok=True, mode=0o700)
+        self._directory.mkdir(parents=True, exist_ok=True, mode=DIRECTORY_MODE)
 
     def put(self, message: StoredMessage) -> bool:
         """Queues the message to be written. Returns False, counted and logged, if it exceeds the limit; a later disk

@@ -257,6 +257,22 @@ def test_a_run_gets_its_outcomes_while_the_waits_of_the_one_before_end() -> None
     asyncio.run(main())
 
 
+def test_two_nodes_do_not_use_the_same_store(tmp_path: Path) -> None:
+    """Both would send its messages, and each would delete what the other one wrote."""
+
+    async def main() -> None:
+        port = free_port()
+        alice = make("alice", 1, 2, port, DirectoryStore(tmp_path / "outbox", 1 << 20))
+        bob = make("bob", 2, 1, port, DirectoryStore(tmp_path / "outbox", 1 << 20))
+        async with alice:
+            with pytest.raises(OSError, match=f"{tmp_path / 'outbox'}: in use by another daemon or program"):
+                await bob.__aenter__()
+        async with bob:
+            assert (await bob.send("stored", b"kept", to="alice")) is not None
+
+    asyncio.run(main())
+
+
 def test_settings_of_another_type_are_named() -> None:
     wrong: Any = {"name": "alice"}
     with pytest.raises(TypeError, match="settings: expected Settings, found dict"):

@@ -197,13 +197,7 @@ def test_a_second_daemon_does_not_take_the_firsts_socket_port_or_files() -> None
             being_written, kept = outbox / f"{7:020d}.new", outbox / f"{6:020d}.message"
             being_written.write_bytes(b"half of")
             kept.write_bytes(b"not all of it is on this disk")
-            second = subprocess.run(
-                [sys.executable, "-m", "udp_mesh.cli.main", "run", str(first.file)],
-                check=False,
-                capture_output=True,
-                text=True,
-                timeout=WAIT_S,
-            )
+            second = _run_to_end(first.file)
             assert second.returncode == 1
             assert f"cannot start: {first.socket}: another daemon is already listening" in second.stderr
             assert "Traceback" not in second.stderr
@@ -211,6 +205,47 @@ def test_a_second_daemon_does_not_take_the_firsts_socket_port_or_files() -> None
             assert kept.exists()
             with first.client() as client:
                 client.request("peers")
+
+
+def test_a_second_daemon_does_not_use_the_firsts_state_directory() -> None:
+    """It would send the messages of the first one's outbox again, and delete files that are being written."""
+    with tempfile.TemporaryDirectory(prefix="udp-mesh-") as path:
+        folder, port = Path(path), free_port()
+        state = folder / "alice"
+        text = configuration(folder, "bob", 2, [1], port).replace(f'"{folder / "bob"}"', f'"{state}"')
+        bob = RunningDaemon(folder, "bob", text)
+        with RunningDaemon(folder, "alice", configuration(folder, "alice", 1, [2], port)) as alice:
+            second = _run_to_end(bob.file)
+            assert second.returncode == 1
+            assert (
+                f"cannot start: {state}: in use by another daemon or program (change `state_directory` in [daemon])"
+                in second.stderr
+            )
+            assert not bob.socket.exists()
+            with alice.client() as client:
+                client.request("peers")
+            alice.kill()
+            with bob:
+                assert bob.socket.exists()
+
+
+def _run_to_end(file: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "udp_mesh.cli.main", "run", str(file)],
+        check=False,
+        capture_output=True,
+        text=True,
+        timeout=WAIT_S,
+    )
+
+
+def test_a_daemon_starts_without_a_usable_state_directory() -> None:
+    with tempfile.TemporaryDirectory(prefix="udp-mesh-") as path:
+        folder = Path(path)
+        (folder / "alice").write_text("a file where the directory should be")
+        alice = RunningDaemon(folder, "alice", configuration(folder, "alice", 1, [2], free_port()))
+        with alice, alice.client() as client:
+            client.request("peers")
 
 
 def test_a_socket_left_by_a_killed_daemon_is_replaced() -> None:
