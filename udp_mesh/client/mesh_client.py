@@ -36,7 +36,8 @@ MAX_REPLY_HEADER_BYTES = 1 << 26
 """Maximum header size of a reply or event: the status of a thousand peers takes some megabytes."""
 MAX_PAYLOAD_BYTES = 1 << 30
 _LENGTHS = struct.Struct(">II")
-_TIMEVAL = struct.Struct("@ll")
+_TIMEVALS = (struct.Struct("@ll"), struct.Struct("=qq"))
+"""What a timeout of the kernel may be: the second, on 32-bit systems whose libc has 64-bit times."""
 _READ_BYTES = 1 << 18
 
 Header = Dict[str, Any]
@@ -171,9 +172,10 @@ class MeshClient:
         # that hangs, which with a timeout of Python's fails at once if others are connecting.
         self._socket.settimeout(None)
         timeout = divmod(int(1e6 * min(max(timeout_s, 0.001), 1e6)), 1_000_000)
-        # A 32-bit system with 64-bit times expects another structure: it has no timeout then.
-        with contextlib.suppress(OSError):
-            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, _TIMEVAL.pack(*timeout))
+        for layout in _TIMEVALS:
+            with contextlib.suppress(OSError):
+                self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, layout.pack(*timeout))
+                break
         try:
             self._socket.connect(path)
         except OSError as error:
