@@ -66,6 +66,8 @@ class Node:
     ) -> None:
         check_type(settings, Settings, "settings")
         check_items(links, LinkConfig, "links")
+        for link in links:
+            _check_link(link)
         check_type(urgent_dscp, int, "urgent_dscp")
         if not 0 <= urgent_dscp <= 63:
             raise ValueError(f"urgent_dscp: expected 0 to 63, found {urgent_dscp}")
@@ -238,6 +240,26 @@ def _check_addresses(settings: Settings) -> None:
             ip_address(neighbor.address[0])
         except ValueError:
             raise ValueError(f"neighbor: expected an IP address, found {neighbor.address[0]!r}") from None
+
+
+def _check_link(link: LinkConfig) -> None:
+    """Raises TypeError or ValueError for a link that names neither or both of its interface and address, or whose
+    address is none."""
+    for name, kind in (("interface", str), ("address", str), ("mtu", int)):
+        value = getattr(link, name)
+        if value is not None:
+            check_type(value, kind, f"link {name}")
+    if (link.interface is None) == (link.address is None):
+        raise ValueError(f"link: expected either interface or address, found {'both' if link.address else 'neither'}")
+    if link.address is not None:
+        try:
+            address = ip_address(link.address)
+        except ValueError:
+            raise ValueError(f"link: expected an IP address, found {link.address!r}") from None
+        if address.version == 6 and address.is_link_local:
+            raise ValueError(
+                f"link: expected an address that is not link-local, found {link.address}: set `interface` instead"
+            )
 
 
 def _unchanging(payload: object) -> bytes:

@@ -285,6 +285,21 @@ def test_settings_of_another_type_are_named() -> None:
     run(body)
 
 
+@pytest.mark.parametrize(
+    ("fields", "error"),
+    [
+        ({}, "link: expected either interface or address, found neither"),
+        ({"interface": "lo", "address": "127.0.4.1"}, "link: expected either interface or address, found both"),
+        ({"address": "robot1"}, "link: expected an IP address, found 'robot1'"),
+        ({"address": "fe80::1"}, "link: expected an address that is not link-local, found fe80::1"),
+        ({"address": "127.0.4.1", "mtu": "1400"}, "link mtu: expected int, found '1400'"),
+    ],
+)
+def test_a_link_that_cannot_be_opened_is_refused(fields: dict[str, Any], error: str) -> None:
+    with pytest.raises((ValueError, TypeError), match=error):
+        Node(Settings("alice", unkeyed=True), links=(LinkConfig(**fields),))
+
+
 def test_a_single_link_in_place_of_a_sequence_is_named() -> None:
     link: Any = LinkConfig(address="127.0.4.1")
     with pytest.raises(TypeError, match="links: expected a tuple of LinkConfig, found LinkConfig"):
