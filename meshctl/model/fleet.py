@@ -132,6 +132,11 @@ class Node:
     site: str = ""
 
     @property
+    def addresses(self) -> tuple[IpInterface, ...]:
+        """Its address in the mesh and, if it routes, that in its robot's LAN."""
+        return (self.address,) if self.lan_address is None else (self.address, self.lan_address)
+
+    @property
     def bridges_lan(self) -> bool:
         """Whether frames pass between its wired ports and its mesh."""
         return bool(self.lan_ports and self.meshes) and self.lan_address is None

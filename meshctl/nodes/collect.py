@@ -77,7 +77,7 @@ def known_macs(fleet: Fleet, known: Mapping[str, LastKnown]) -> dict[str, str]:
 def former_places(fleet: Fleet, known: Mapping[str, LastKnown]) -> dict[str, SshAddress]:
     """Where nodes were last seen, if the inventory has another address or port by now: a node that was off, or that has
     not been changed yet, still answers there, on the mesh that it was in."""
-    taken = {own.ip for node in fleet.managed() for own in (node.address, node.lan_address) if own is not None}
+    taken = {own.ip for node in fleet.managed() for own in node.addresses}
     found = {}
     for name, last in known.items():
         place, node = login_place(last.facts), fleet.nodes.get(name)

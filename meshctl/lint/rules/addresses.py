@@ -201,13 +201,12 @@ def gateway_unreachable(fleet: Fleet, _context: LintContext) -> Iterator[Finding
     for node in fleet.managed():
         if node.gateway is None:
             continue
-        own = [address for address in (node.address, node.lan_address) if address is not None]
-        is_itself = any(node.gateway == address.ip for address in own)
+        is_itself = any(node.gateway == address.ip for address in node.addresses)
         if not is_itself and unclear.intersection(node.meshes):
             continue
-        if is_itself or not any(node.gateway in address.network for address in own):
+        if is_itself or not any(node.gateway in address.network for address in node.addresses):
             message = "it is the node's own address" if is_itself else "not reachable from the node"
-            expected = f"another station in {' or '.join(str(address.network) for address in own)}"
+            expected = f"another station in {' or '.join(str(address.network) for address in node.addresses)}"
             hint = "Write `gateway: null` at this node, or in a group of the nodes with an uplink." if is_itself else ""
             yield Finding(("nodes", node.name, "gateway"), message, expected, str(node.gateway), hint)
 

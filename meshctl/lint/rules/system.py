@@ -114,9 +114,7 @@ def server_unknown(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     """,
 )
 def server_is_radio(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    radios: dict[IpAddress | None, Node] = {
-        address.ip: node for node in fleet.managed() for address in (node.address, node.lan_address) if address
-    }
+    radios: dict[IpAddress | None, Node] = {address.ip: node for node in fleet.managed() for address in node.addresses}
     addresses = {
         **{robot.name: robot.computer.address.ip for robot in fleet.robots.values() if robot.computer is not None},
         **{node.name: node.address.ip for node in fleet.managed()},

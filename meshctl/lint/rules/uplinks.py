@@ -106,7 +106,7 @@ def gateway_not_a_station(fleet: Fleet, _context: LintContext) -> Iterator[Findi
     using = group_by_key((node.gateway, node) for node in fleet.managed() if node.gateway is not None)
     for gateway, nodes in using.items():
         # MC204 reports one that is not in the node's network
-        own = [address for node in nodes for address in (node.address, node.lan_address) if address is not None]
+        own = [address for node in nodes for address in node.addresses]
         if gateway in known or not any(gateway in address.network for address in own):
             continue
         path = ("nodes", nodes[0].name, "gateway")
