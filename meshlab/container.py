@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from meshlab import namespaces as ns
-from meshlab.rootfs import library_folders
+from meshlab.rootfs import INIT_SHELL, library_folders
 
 FLAGS = ns.CLONE_NEWNS | ns.CLONE_NEWPID | ns.CLONE_NEWNET | ns.CLONE_NEWUTS | ns.CLONE_NEWIPC
 _DEVICES = ("null", "zero", "full", "random", "urandom", "tty")
@@ -103,7 +103,8 @@ def become_node(container: Container, report: int, gate: int | None = None) -> N
         _mount_all(container)
         if container.deny_setgroups:
             ns.accept_setgroups()
-        os.execve("/bin/sh", ["/bin/sh", "/rom/lab/init"], _ENVIRONMENT)
+        shell = INIT_SHELL if Path(INIT_SHELL).exists() else "/bin/sh"
+        os.execve(shell, [shell, "/rom/lab/init"], _ENVIRONMENT)
     except OSError as error:
         os.write(report, str(error).encode())
     finally:

@@ -5,6 +5,9 @@ find the programs -> copy them -> remove applets that OpenWrt's busybox does not
 Debian's busybox is a "standalone shell": its ash runs its own applets before it searches PATH, so a stand-in for
 `sync`, `reboot` or `logread` would never run. OpenWrt's is not. Applet names are in one sorted table of the program;
 in the fleet's copies the unwanted names are overwritten in place, keeping the order.
+
+In busybox 1.38.0, a shell that has caught a signal hangs in its next `read` (reported as openwrt/openwrt#23745). Where
+the host's does, dash runs process 1, which alone catches signals.
 """
 
 from __future__ import annotations
@@ -18,6 +21,8 @@ from pathlib import Path
 from meshlab.errors import LabError
 
 STAND_INS = Path(__file__).resolve().parent / "node_root"
+INIT_SHELL = "/rom/lab/init-shell"
+"""What runs process 1 of a node, where its own shell cannot; it need not exist."""
 
 # applets that stand-ins replace: the fleet's busybox must not have these names
 _REPLACED = frozenset({"date", "sync", "fsync", "reboot", "poweroff", "halt", "logread", "logger", "sh", "ash"})
@@ -38,6 +43,9 @@ def build(
     busybox = find_program("busybox", "busybox-static", sysroot=sysroot)
     dropbear = find_program("dropbear", "dropbear-bin", sysroot=sysroot)
     dropbearkey = find_program("dropbearkey", "dropbear-bin", sysroot=sysroot)
+    copied = {"dropbear": dropbear, "dropbearkey": dropbearkey}
+    if hangs_in_read(busybox):
+        copied[Path(INIT_SHELL).name] = find_program("dash", "dash", sysroot=sysroot)
     shutil.copytree(STAND_INS, rom, ignore=shutil.ignore_patterns("__pycache__"))
     if more is not None:
         shutil.copytree(more, rom, dirs_exist_ok=True)
@@ -46,10 +54,10 @@ def build(
     for script in (path for path in rom.rglob("*") if path.is_file()):
         # a wheel does not keep the executable bit
         script.chmod(0o755 if script.read_bytes().startswith(b"#!") else 0o644)
-    for name, program in (("dropbear", dropbear), ("dropbearkey", dropbearkey)):
+    for name, program in copied.items():
         shutil.copy2(program, rom / "lab" / name)
     if sysroot is None:
-        _copy_libraries((busybox, dropbear, dropbearkey), rom)
+        _copy_libraries((busybox, *copied.values()), rom)
     else:
         _note_library_folders(library_folders, rom)
     _install_busybox(busybox, rom)
@@ -141,6 +149,13 @@ def _is_standalone(shell: Path) -> bool:
         [str(shell), "ash", "-c", "PATH=/nonexistent; cat /dev/null"], capture_output=True, check=False
     )
     return found.returncode == 0
+
+
+def hangs_in_read(busybox: Path) -> bool:
+    """Whether its ash hangs in a `read` once it has caught a signal. It uses the processor then, of which it gets one
+    second."""
+    script = "ulimit -t 1; trap : USR1; kill -USR1 $$; read -r line </proc/version"
+    return subprocess.run([str(busybox), "ash", "-c", script], capture_output=True, check=False).returncode != 0
 
 
 def without_applets(image: bytes, names: Sequence[str], hidden: Iterable[str], *, keep: Sequence[str]) -> bytes:
