@@ -214,10 +214,14 @@ def _entry_text(key: str, value: Tree) -> str:
     return f"{key}: {value.text}" if is_shown and isinstance(value, Scalar) else f"{key}: ..."
 
 
+def allowed_values(error: ErrorDetails) -> list[str]:
+    """The values that a field allows, if the error is a value that is none of them; else empty."""
+    expected = str(error.get("ctx", {}).get("expected", "")) if error["type"] == "enum" else ""
+    return [word for word in expected.split("'") if word.strip(", or")]
+
+
 def _enum_hint(root: MappingNode, path: tuple[int | str, ...], error: ErrorDetails) -> str:
-    found = _found(root, path, "enum").strip("'")
-    known = [word for word in str(error.get("ctx", {}).get("expected", "")).split("'") if word.strip(", or")]
-    return did_you_mean(found, known)
+    return did_you_mean(_found(root, path, "enum").strip("'"), allowed_values(error))
 
 
 def _unit_hint(root: MappingNode, path: tuple[int | str, ...]) -> str:
