@@ -61,6 +61,42 @@ _UNITS = {
     "_s": "seconds",
     "_tu": "time units of 1.024 ms",
 }
+# Names of keys in UCI, of other tools and of the field, and the keys that they mean where a mapping has them.
+_OTHER_NAMES: Mapping[str, tuple[str, ...]] = {
+    "authorized_keys": ("ssh_keys",),
+    "antenna_gain": ("antenna_gain_dbi",),
+    "bandwidth": ("htmode",),
+    "cell_id": ("bssid",),
+    "channel_width": ("htmode",),
+    "distance": ("distance_m",),
+    "essid": ("ssid",),
+    "gain": ("antenna_gain_dbi",),
+    "hop_limit": ("relay_hops",),
+    "ifname": ("lan_ports",),
+    "ip": ("address",),
+    "ipaddr": ("address",),
+    "ip_address": ("address",),
+    "mesh_id": ("ssid",),
+    "model": ("board",),
+    "name": ("hostname", "ssid"),
+    "ntp": ("ntp_servers",),
+    "ntp_server": ("ntp_servers",),
+    "passphrase": ("key",),
+    "password": ("key",),
+    "ports": ("lan_ports",),
+    "power": ("tx_power_dbm",),
+    "protocol": ("backend",),
+    "psk": ("key",),
+    "public_keys": ("ssh_keys",),
+    "regdomain": ("country",),
+    "routing": ("backend",),
+    "subnet": ("network",),
+    "syslog": ("log_host",),
+    "tags": ("groups",),
+    "tx_power": ("tx_power_dbm",),
+    "txpower": ("tx_power_dbm",),
+    "width": ("htmode",),
+}
 # Keys whose values are shares of a whole.
 _SHARES = frozenset({"quorum", "duty_cycle", "scale"})
 _PERCENT = re.compile(r"([0-9]{1,3}(?:\.[0-9]{1,6})?) ?%?")
@@ -112,9 +148,11 @@ def _is_partial(root: MappingNode, path: tuple[int | str, ...]) -> bool:
 
 
 def _meant(wrong: str, known: Sequence[str]) -> tuple[str, ...]:
-    """The keys that an unknown one probably is: the same with its unit (`x` for `x_m`), else the most similar ones."""
+    """The keys that an unknown one probably is: the same with its unit (`x` for `x_m`), one with another name, else
+    the most similar ones."""
     with_unit = tuple(f"{wrong}{unit}" for unit in _UNITS if f"{wrong}{unit}" in known)
-    return with_unit or nearest(wrong, known)
+    renamed = tuple(key for key in _OTHER_NAMES.get(wrong.lower(), ()) if key in known)
+    return with_unit or renamed[:1] or nearest(wrong, known)
 
 
 def _diagnostic(root: MappingNode, error: ErrorDetails) -> Diagnostic:

@@ -32,6 +32,9 @@ def _errors(old: str, new: str, directory: Path) -> list[Diagnostic]:
             "write `null` to remove the value of an earlier layer",
         ),
         ("base: {role: base,", "base: {role: base, position: {x: 1, y_m: 2},", "did you mean 'x_m'?"),
+        ("ssid: my-fleet", "mesh_id: my-fleet", "did you mean 'ssid'?"),
+        ("base: {role: base, address:", "base: {role: base, ipaddr:", "did you mean 'address'?"),
+        ("htmode: HT20", "width: HT20", "did you mean 'htmode'?"),
         ('carries: ["rover1-b[01-06]"]', "carries: [rover1-b[01-06]]", 'quote a range in a list: ["b[01-12]"]'),
         (
             "base: {role: base,",
