@@ -260,3 +260,14 @@ def test_the_controller_of_a_pci_radio_tells_the_chip(path: str, target: str, tm
     (tmp_path / "right").mkdir()
     right = fragment.replace("radios:", f"target: {target or 'ath79/generic'}, radios:")
     assert [one for one in _found(right, tmp_path / "right") if one.code == "MC834"] == []
+
+
+def test_a_network_that_is_too_small_for_a_range_is_one_finding(tmp_path: Path) -> None:
+    """Addresses that end in 0 and 255 outside the network were reported, too."""
+    fragment = """
+    meshes: {main: {network: 10.42.0.0/25}}
+    nodes: {"n[001-200]": {address: {from: 10.42.0.120}}}
+    """
+    found = [one for one in _found(fragment, tmp_path) if one.code in ("MC202", "MC203")]
+    assert [(one.code, one.path) for one in found] == [("MC202", "meshes.main.network")]
+    assert found[0].expected == "a network with 10.42.0.128 to 10.42.1.63, such as 10.42.0.0/23"
