@@ -97,6 +97,31 @@ _OTHER_NAMES: Mapping[str, tuple[str, ...]] = {
     "txpower": ("tx_power_dbm",),
     "width": ("htmode",),
 }
+# Values in UCI's and the field's words, by key, and the values that they mean.
+_OTHER_VALUES: Mapping[str, Mapping[str, str]] = {
+    "mode": {"11s": "mesh", "802.11s": "mesh", "mesh point": "mesh", "meshpoint": "mesh", "ibss": "adhoc"},
+    "band": {"2.4": "2g", "2.4ghz": "2g", "5": "5g", "5ghz": "5g"},
+    "encryption": {
+        "open": "none",
+        "psk2": "psk2+ccmp",
+        "psk2+aes": "psk2+ccmp",
+        "wpa2": "psk2+ccmp",
+        "wpa2-psk": "psk2+ccmp",
+        "wpa3": "sae",
+    },
+    "backend": {"batman": "batman-adv", "batadv": "batman-adv", "bat0": "batman-adv"},
+    "role": {
+        "ap": "beacon",
+        "client": "beacon",
+        "gateway": "base",
+        "node": "beacon",
+        "relay": "beacon",
+        "repeater": "beacon",
+        "router": "beacon",
+        "station": "base",
+    },
+    "state": {"active": "deployed", "offline": "spare", "online": "deployed", "stored": "spare"},
+}
 # Keys whose values are shares of a whole.
 _SHARES = frozenset({"quorum", "duty_cycle", "scale"})
 _PERCENT = re.compile(r"([0-9]{1,3}(?:\.[0-9]{1,6})?) ?%?")
@@ -170,6 +195,8 @@ def _diagnostic(root: MappingNode, error: ErrorDetails) -> Diagnostic:
         known = _known_keys(path[:-1])
         wrong = str(path[-1])
         hint = suggestion(_meant(wrong, known)) or f"known keys: {', '.join(known)}"
+        if wrong.startswith(("x-", ".")):
+            hint = "no key holds values for anchors alone: set the anchor (`&`) where its value is first used"
         if _is_rest_of_a_text(root, path):
             hint = "a comma ends a text within {}: if this belongs to the text before it, quote the whole text"
         return codes.error(codes.UNKNOWN_KEY, place, f"unknown key '{printable(wrong)}'", path=dotted, hint=hint)
@@ -259,7 +286,9 @@ def allowed_values(error: ErrorDetails) -> list[str]:
 
 
 def _enum_hint(root: MappingNode, path: tuple[int | str, ...], error: ErrorDetails) -> str:
-    return did_you_mean(_found(root, path, "enum").strip("'"), allowed_values(error))
+    found = _found(root, path, "enum").strip("'")
+    meant = _OTHER_VALUES.get(str(path[-1]), {}).get(found.lower().replace(" ghz", "ghz"), "")
+    return suggestion((meant,)) if meant else did_you_mean(found, allowed_values(error))
 
 
 def _unit_hint(root: MappingNode, path: tuple[int | str, ...]) -> str:
@@ -275,6 +304,8 @@ def _unit_hint(root: MappingNode, path: tuple[int | str, ...]) -> str:
         return f"write a point: {tree.text.replace(',', '.')}"
     if tree.is_plain and tree.text.lower() in ("none", "no", "off") and path[-1] in ("gateway", "lan_filter", "mesh"):
         return "write `null` to remove the value of an earlier layer"
+    if path[-1] == "env" and tree.text.startswith("$"):
+        return "write the variable's name alone, without `$`"
     if not _WITH_UNIT.fullmatch(tree.text):
         return ""
     unit = next((unit for suffix, unit in _UNITS.items() if str(path[-1]).endswith(suffix)), "")
