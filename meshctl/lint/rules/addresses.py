@@ -43,9 +43,12 @@ def meshes_of(fleet: Fleet, node: Node) -> list[Mesh]:
 def address_twice(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     # by place: a range that overlaps another is one mistake
     at: dict[Position, dict[str, list[tuple[tuple[str, ...], str, IpAddress]]]] = {}
+    lans = _overlapping_lans(fleet)
     for address, owners in duplicates(stations(fleet)):
-        (_, first), *later = owners
+        (first_path, first), *later = owners
         for path, name in later:
+            if first_path[1] in lans and path[1] in lans and first_path[0] == path[0] == "robots":
+                continue  # MC216 reports the LANs
             at.setdefault(fleet.where(*path).position, {}).setdefault(first, []).append((path, name, address))
     for by_first in at.values():
         if len(by_first) == 1:
@@ -57,6 +60,12 @@ def address_twice(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
         message = f"{join_limited([name for _, name, _ in taken])} have the addresses of {join_limited(list(by_first))}"
         found = join_limited([str(address) for _, _, address in taken])
         yield Finding(taken[0][0], message, "unique addresses", found)
+
+
+def _overlapping_lans(fleet: Fleet) -> frozenset[str]:
+    """The robots whose LANs overlap that of another one."""
+    lans = ((robot.name, robot.lan) for robot in fleet.robots.values() if robot.lan is not None)
+    return frozenset(name for pair in overlaps(lans) for name, _ in pair)
 
 
 def stations(fleet: Fleet) -> Iterator[tuple[IpAddress, tuple[tuple[str, ...], str]]]:

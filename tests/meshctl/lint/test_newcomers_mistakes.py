@@ -271,3 +271,16 @@ def test_a_network_that_is_too_small_for_a_range_is_one_finding(tmp_path: Path) 
     found = [one for one in _found(fragment, tmp_path) if one.code in ("MC202", "MC203")]
     assert [(one.code, one.path) for one in found] == [("MC202", "meshes.main.network")]
     assert found[0].expected == "a network with 10.42.0.128 to 10.42.1.63, such as 10.42.0.0/23"
+
+
+def test_two_robots_with_one_lan_are_one_finding(tmp_path: Path) -> None:
+    """The routers' and the computers' addresses, which are equal because the LANs are, were reported, too."""
+    fragment = """
+    nodes: {husky2-front: {role: robot, address: 10.42.0.12}}
+    robots:
+      base-station: {computer: {gateway: 10.42.0.1}}
+      husky1: {lan: {network: 10.43.1.0/24}, computer: {address: 10.43.1.10/24}}
+      husky2: {nodes: [husky2-front], lan: {network: 10.43.1.0/24}, computer: {address: 10.43.1.10/24}}
+    """
+    found = [one for one in _found(fragment, tmp_path) if one.code in ("MC201", "MC216")]
+    assert [(one.code, one.path) for one in found] == [("MC216", "robots.husky2.lan.network")]
