@@ -166,7 +166,7 @@ def edits(rows: Iterable[Row], fleet: Fleet, file: str, *, add: bool = False) ->
         values = {key: value for key, value in row.values.items() if key != NODE}
         place = Position(file, row.line)
         if node is not None:
-            changed = {key: value for key, value in values.items() if value != _GETTERS[key](node)}
+            changed = {key: value for key, value in values.items() if not _has(node, key, value)}
             if changed:
                 found.append(NodeEdit(node.name, row.line, False, _parsed(changed)))
         elif not (name or label):
@@ -183,6 +183,11 @@ def edits(rows: Iterable[Row], fleet: Fleet, file: str, *, add: bool = False) ->
     if errors:
         raise InvalidInput(errors[: codes.MAX_DIAGNOSTICS])
     return tuple(found)
+
+
+def _has(node: Node, column: str, value: str) -> bool:
+    """Whether the node has this value already; an address may have its prefix length."""
+    return value == _GETTERS[column](node) or (column == "address" and value == str(node.address))
 
 
 def _unknown_or_taken(found: Iterable[NodeEdit], fleet: Fleet, file: str) -> Iterator[Diagnostic]:

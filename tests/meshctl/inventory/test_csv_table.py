@@ -234,6 +234,13 @@ def test_a_usual_heading_is_mapped_to_its_column(heading: str, hint: str) -> Non
     assert raised.value.diagnostics[0].hint.startswith(hint)
 
 
+def test_an_address_with_its_prefix_length_is_no_change(inventory: Path) -> None:
+    fleet = load_fleet(inventory)
+    same = fleet.nodes["husky1-b01"].address
+    assert edits(read(f"node,address\nhusky1-b01,{same}\n", "x"), fleet, "x") == ()
+    assert edits(read(f"node,address\nhusky1-b01,{same.ip}/16\n", "x"), fleet, "x") != ()
+
+
 def test_a_value_in_another_case_has_a_hint() -> None:
     with pytest.raises(InvalidInput) as raised:
         read("node,state\nbase,Deployed\n", "boxes.csv")
