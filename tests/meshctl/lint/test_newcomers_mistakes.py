@@ -284,3 +284,10 @@ def test_two_robots_with_one_lan_are_one_finding(tmp_path: Path) -> None:
     """
     found = [one for one in _found(fragment, tmp_path) if one.code in ("MC201", "MC216")]
     assert [(one.code, one.path) for one in found] == [("MC216", "robots.husky2.lan.network")]
+
+
+def test_a_board_without_its_vendor_is_reported_at_the_board(tmp_path: Path) -> None:
+    """The profile was expected to be `tl-wr841n-v9`."""
+    names = "board: tl-wr841-v9, profile: tplink_tl-wr841-v9"
+    (finding,) = [one for one in _found(f"hardware: {{rocket: {{{names}}}}}", tmp_path) if one.code == "MC825"]
+    assert (finding.path, finding.expected) == ("hardware.rocket.board", "tplink,tl-wr841-v9")
