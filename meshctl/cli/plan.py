@@ -130,7 +130,7 @@ def apply(
     key: KeyFiles = None,
     lab: Lab = None,
 ) -> None:
-    """Apply a saved plan. Nodes that have changed since then are refused.
+    """Apply a saved plan, without asking for confirmation. Nodes that have changed since then are refused.
 
     Example: meshctl apply plan.json
     """
