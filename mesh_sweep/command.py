@@ -25,12 +25,13 @@ _SHOWN_FAILURES = 10
 @dataclass(frozen=True, slots=True)
 class Study:
     """A scenario to sweep: `check` raises SweepError for settings that it does not accept; `figures` are the patterns
-    of those that are shown by default."""
+    of those that are shown by default, `inputs` the files of the scenario."""
 
     identity: Identity
     run: RunCase
     check: Callable[[Settings], None]
     figures: tuple[str, ...]
+    inputs: tuple[Path, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +71,7 @@ def sweep(study: Study, options: SweepOptions, short: dict[str, str]) -> int:
     goals = parse_goals(options.goals)
     workers = options.workers()
     out = options.out or Path(f"{study.identity.scenario}-sweep.jsonl")
-    _check_report(options.report, out)
+    _check_report(options.report, out, study.inputs)
     if options.report is not None:
         # before hours of work
         with options.report.open("ab") as opened:
@@ -112,10 +113,14 @@ def show(file: Path, options: SweepOptions, default_figures: tuple[str, ...]) ->
     return _show(stored.identity, stored.results, options, default_figures)
 
 
-def _check_report(report: Path | None, results: Path) -> None:
-    """Raise SweepError for a report that would replace the results."""
-    if report is not None and report.resolve() == results.resolve():
+def _check_report(report: Path | None, results: Path, inputs: Sequence[Path] = ()) -> None:
+    """Raise SweepError for a report that would replace the results, or a file of the scenario."""
+    if report is None:
+        return
+    if report.resolve() == results.resolve():
         raise SweepError(f"--report {report}: expected another file than that of the results: give it another name")
+    if report.resolve() in [each.resolve() for each in inputs]:
+        raise SweepError(f"--report {report}: expected another file than those of the scenario: give it another name")
 
 
 def _show(

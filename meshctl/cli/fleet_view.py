@@ -99,7 +99,7 @@ def open_fleet_view(
     """Open the fleet and close it at the end. Raises InvalidInput, InputError, MeshctlError."""
     password = None if no_robots else sudo_password(ask_sudo)
     with session(inventory, key_files=key or (), lab=lab, changes_nothing=True) as opened:
-        opened.access.deadlines = _deadlines(timeout)
+        opened.access.deadlines = query_deadlines(timeout)
         robots, skipped = _robots(opened, not no_robots)
         connector = RobotConnector(opened.fleet, opened.access, lambda: password) if robots else None
         sites = None if direct else site_observer(opened, inventory)
@@ -129,9 +129,12 @@ def with_fleet_view(command: Callable[..., None]) -> Callable[..., None]:
     return with_options("fleet_view", open_fleet_view, _SHARED)(command)
 
 
-def _deadlines(connect_s: float) -> Deadlines:
-    """Later steps get twice as long: they also take computation on a slow processor."""
-    return Deadlines(connect_s, handshake_s=2 * connect_s, auth_s=2 * connect_s, channel_s=2 * connect_s)
+def query_deadlines(connect_s: float) -> Deadlines:
+    """Later steps get twice as long: they also take computation on a slow processor. So may a kept connection be
+    silent, because a snapshot is complete only when every device has answered or is given up."""
+    later_s = 2 * connect_s
+    ask_s = min(connect_s, Deadlines().ask_s)
+    return Deadlines(connect_s, handshake_s=later_s, auth_s=later_s, channel_s=later_s, ask_s=ask_s, silence_s=later_s)
 
 
 def _robots(opened: Session, with_robots: bool) -> tuple[tuple[str, ...], str]:

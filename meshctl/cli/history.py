@@ -62,7 +62,7 @@ def history(
     # runs of labs are in the journal of this computer, not in a shared one
     in_use = os.environ.get("MESHCTL_LAB", "") if lab is None else ""
     with open_journal(
-        os.environ, echo_error, lab=in_use, changes_nothing=True, of_this_computer=lab is True
+        os.environ, echo_error, lab=in_use, changes_nothing=True, of_this_computer=lab is True, for_display=True
     ) as journal:
         run_filter = _RunFilter(node, fleet, lab)
         if follow:

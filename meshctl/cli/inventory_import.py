@@ -85,6 +85,9 @@ def import_netbox(
         # as for every other selection: nothing is usually a typo
         asked = f" matches {' '.join(f'--filter {word}' for word in query)}" if query else ""
         raise InputError(f"{url}: no device{asked}", hint="see the list of devices in NetBox")
+    unnamed = sum(not device.get("name") for device in devices)
+    if unnamed:
+        echo(f"left out: {counted(unnamed, 'device')} without a name in NetBox", err=True)
     place = f"{url.rstrip('/')}/dcim/devices"
     found = checked(netbox_rows(devices, interfaces, fleet), place)
     _take_over(inventory, fleet, found, place, add=add, new_in=file, dry_run=dry_run, as_json=as_json)

@@ -98,7 +98,8 @@ def lint(
     if select:
         findings = _selected(findings, _prefixes(select, (*BY_CODE, *MEANINGS)))
     if write_baseline and baseline is not None:
-        write_file(baseline, baselines.dump(item for item in findings.diagnostics if item.code in BY_CODE))
+        known = baselines.dump(item for item in findings.diagnostics if item.code in BY_CODE)
+        write_file(baseline, known, inventory=findings.sources)
         echo(f"wrote {counted(len(findings.diagnostics), 'finding')} to {baseline}", err=True)
         return
     if baseline is not None:
@@ -106,7 +107,7 @@ def lint(
     width = None if output is not None else terminal_width(sys.stdout)
     report = formatted(findings, "json" if json else format.value, width)
     if output is not None:
-        write_file(output, report)
+        write_file(output, report, inventory=findings.sources)
         echo(f"{summary(findings)}: written to {output}", err=True)
     else:
         # JSON and SARIF are escaped, which keeps their values; other formats are sanitized

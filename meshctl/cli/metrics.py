@@ -52,6 +52,8 @@ def metrics(
 
     if sum((file_sd, rules, dashboard)) > 1:
         raise InputError("expected one of --file-sd, --rules and --dashboard")
+    if textfile is not None:
+        prometheus.check_textfile(textfile)
     if rules or dashboard:
         text = prometheus.alert_rules() if rules else prometheus.dashboard()
     elif file_sd:

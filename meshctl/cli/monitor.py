@@ -37,7 +37,7 @@ from meshctl.monitor.hooks import AlarmHooks, HookSettings
 from meshctl.monitor.meters import MeterReadings
 from meshctl.monitor.metrics import render_metrics
 from meshctl.monitor.page import recording_of, save_page
-from meshctl.monitor.prometheus import TextfileWriter
+from meshctl.monitor.prometheus import TextfileWriter, check_textfile
 from meshctl.monitor.recording_page import documents_of, scratch_for
 from meshctl.monitor.replay import is_history, open_recordings
 from meshctl.monitor.sampler import FrameSampler
@@ -155,6 +155,8 @@ def monitor(
         _replay(replay, out, web, as_json=as_json)
         return
     hook_settings = HookSettings(webhook, _words(hook), hook_level)
+    if textfile is not None:
+        check_textfile(textfile)
     with ExitStack() as stack:
         view = stack.enter_context(
             open_fleet_view(

@@ -96,11 +96,14 @@ def lose_reader() -> None:
     discard_output()
 
 
-def write_file(path: Path, content: str | bytes, *, inventory: Iterable[str] = ()) -> None:
+def write_file(path: Path, content: str | bytes, *, inventory: Iterable[str] = (), inputs: Iterable[Path] = ()) -> None:
     """Write the file that an option names, such as `--out`. Raises InputError with the reason if that fails, or if it
-    is one of the inventory's; an earlier file then stays as it was."""
-    if os.path.realpath(path) in map(os.path.realpath, inventory):
+    is one of the inventory's or of the command's other inputs; an earlier file then stays as it was."""
+    target = os.path.realpath(path)
+    if target in map(os.path.realpath, inventory):
         raise InputError(f"{path} is a file of the inventory, and would be overwritten", hint="name another file")
+    if target in map(os.path.realpath, inputs):
+        raise InputError(f"{path} is an input of this command, and would be overwritten", hint="name another file")
     data = content.encode() if isinstance(content, str) else content
     try:
         if path.exists() and not path.is_file():

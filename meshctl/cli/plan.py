@@ -25,7 +25,7 @@ from meshctl.cli.plan_execution import (
     report_plan,
     saved_plan,
 )
-from meshctl.cli.run_record import run_of
+from meshctl.cli.run_record import LAST, run_number, run_of
 from meshctl.cli.saved_site_plans import SavedSitePlans, check_fleet, dump_site_plans, load_site_plans
 from meshctl.cli.site_files import hand_over, with_sent_states
 from meshctl.cli.site_runs import (
@@ -130,7 +130,7 @@ def apply(
     key: KeyFiles = None,
     lab: Lab = None,
 ) -> None:
-    """Apply a saved plan. Nodes that have changed since then are refused.
+    """Apply a saved plan, without asking for confirmation. Nodes that have changed since then are refused.
 
     Example: meshctl apply plan.json
     """
@@ -205,7 +205,9 @@ def provision(
 
 
 def resume(
-    run: Annotated[int | None, typer.Argument(help="Run number; default: the last unfinished run.")] = None,
+    run: Annotated[
+        str | None, typer.Argument(help="Run number, or `last`: the latest unfinished run, as by default.")
+    ] = None,
     inventory: InventoryPath = Path(),
     dry_run: DryRun = False,
     yes: Yes = False,
@@ -318,17 +320,19 @@ def bench_advice(run: int, command: str, plan: Plan) -> tuple[str, ...]:
     )
 
 
-def _to_resume(journal: Journal, fleet: str, run_id: int | None) -> tuple[RunRecord, tuple[str, ...]]:
+def _to_resume(journal: Journal, fleet: str, run: str | None) -> tuple[RunRecord, tuple[str, ...]]:
     """The run to resume, and its unfinished nodes."""
+    if run not in (None, LAST):
+        record = run_of(journal, fleet, run_number(run, ()))
+        return record, journal.unfinished(record.id)
     left = journal.unfinished_runs(fleet)
-    number = run_id if run_id is not None else next(iter(left), None)
+    number = next(iter(left), None)
     if number is None:
         latest = next(iter(journal.runs(fleet=fleet, limit=1)), None)
         if latest is None:
             raise InputError(f"fleet {fleet} has no run to resume", hint="start one with `meshctl provision`")
         return latest, ()
-    record = run_of(journal, fleet, number)
-    return record, left.get(number, ()) if run_id is None else journal.unfinished(number)
+    return run_of(journal, fleet, number), left[number]
 
 
 def _still_managed(opened: Session, names: Iterable[str]) -> list[str]:

@@ -58,12 +58,12 @@ def plan_placement(
 
     Example: meshctl plan-placement mine.yaml 0,0 55,12 --beacons 4 --json
     """
-    terrain, air, stops, view = _read(map_file, route, wall_loss, exponent)
+    terrain, air, stops, view, inputs = _read(map_file, route, wall_loss, exponent)
     found = plan(terrain, air, stops, margin_db=margin, beacons=beacons, tx_power_dbm=tx_power)
     if svg_file is not None:
-        write_file(svg_file, svg(view, found))
+        write_file(svg_file, svg(view, found), inputs=inputs)
     if png_file is not None:
-        write_file(png_file, png(view, found))
+        write_file(png_file, png(view, found), inputs=inputs)
     if as_json:
         echo_json(json.dumps(_json(found), indent=2))
     elif as_csv:
@@ -75,8 +75,8 @@ def plan_placement(
 
 def _read(
     map_file: Path, route: list[str], wall_loss: float, exponent: float | None
-) -> tuple[Terrain, RadioModel, tuple[Point, ...], MapView]:
-    """The terrain, the model, the route and what to draw."""
+) -> tuple[Terrain, RadioModel, tuple[Point, ...], MapView, tuple[Path, ...]]:
+    """The terrain, the model, the route, what to draw, and the files that were read."""
     # both need the inventory's YAML reader, which takes a tenth of the start-up
     from meshctl.inventory.yaml_entries import read
     from meshctl.placement import ground, occupancy_map
@@ -89,13 +89,14 @@ def _read(
         stops = occupancy.way(tuple(_point(word, {}) for word in route))
         model = PathLossModel() if exponent is None else PathLossModel(exponent=exponent)
         wall = Wall(stops[0], stops[0], loss_db=wall_loss)
-        return MappedTerrain(occupancy, wall), model, stops, MapView(occupancy=occupancy)
+        files = (map_file, map_file.parent / root.mapping()["image"].text())
+        return MappedTerrain(occupancy, wall), model, stops, MapView(occupancy=occupancy), files
     found = ground.load(map_file)
     air = found.air
     if exponent is not None:
         raise InputError(f"--exponent: set air.exponent in {map_file}")
     stops = tuple(_point(word, {name: placed.at for name, placed in found.positions.items()}) for word in route)
-    return Walls(found.walls), air, stops, MapView(walls=found.walls)
+    return Walls(found.walls), air, stops, MapView(walls=found.walls), (map_file,)
 
 
 def _point(word: str, nodes: dict[str, Point]) -> Point:

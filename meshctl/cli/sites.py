@@ -31,6 +31,7 @@ from meshctl.sites.nats_uplink import NatsUplink
 from meshctl.sites.service import start_service, unit, unit_name
 from meshctl.sites.ssh_uplink import SshUplink
 from meshctl.suggest import did_you_mean
+from meshctl.wording import join_limited
 
 app = typer.Typer(no_args_is_help=True)
 
@@ -49,7 +50,7 @@ def selected_sites(opened: Session, names: Iterable[str] | None, *, with_login: 
     wanted = list(names or ())
     for name in wanted:
         if name not in opened.fleet.sites:
-            hint = did_you_mean(name, opened.fleet.sites) or "the inventory's sites are in `sites`"
+            hint = did_you_mean(name, sites) or (f"its sites are {join_limited(list(sites))}" if sites else "")
             raise InputError(f"no site of {opened.fleet.name} is named {name!r}", hint=hint)
         if name not in able:
             raise InputError(f"site {name} has no gateway", hint=setting.format(name))

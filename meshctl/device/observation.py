@@ -260,7 +260,10 @@ class FileInfo:
 
 @dataclass(frozen=True, slots=True)
 class ChangeStatus:
-    """The state of the dead-man's switch (`deadman.sh status`); see docs/device-scripts.md for the states."""
+    """The state of the dead-man's switch (`deadman.sh status`); see docs/device-scripts.md for the states.
+
+    `is_reloading_restored`: a rollback has ended, and its services still reload.
+    """
 
     state: str
     change_id: str = ""
@@ -276,6 +279,7 @@ class ChangeStatus:
     last_reason: str = ""
     version: str = ""
     installed: bool = True
+    is_reloading_restored: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,17 +25,19 @@ def open_journal(
     pinned: Callable[[str], Iterable[str]] = lambda node: (),
     changes_nothing: bool = False,
     of_this_computer: bool = False,
+    for_display: bool = False,
 ) -> Journal:
     """The journal of real fleets as `environ` says; that of a virtual fleet, or with `of_this_computer`, is always the
     file of this computer.
 
-    With `changes_nothing`, a file that cannot be written is a warning. Raises InputError for a bad URL, MeshctlError
-    for a file or a database that cannot be used.
+    With `changes_nothing`, a file that cannot be written is a warning; `for_display` is for a command that shows the
+    journal, which must not call an unreadable one empty. Raises InputError for a bad URL, MeshctlError for a file or a
+    database that cannot be used.
     """
     path, url = default_path(environ), environ.get(STORE_VARIABLE, "")
 
     def own_file() -> Path | TolerantStore:
-        return TolerantStore.open(path, notify) if changes_nothing else path
+        return TolerantStore.open(path, notify, for_display=for_display) if changes_nothing else path
 
     if not url or lab or of_this_computer:
         return Journal(own_file(), lab=lab, pinned=pinned)

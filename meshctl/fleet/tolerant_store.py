@@ -20,6 +20,17 @@ from meshctl.fleet.store import Claim, Statement, Store, Transaction
 _IN_MEMORY = Path(":memory:")
 
 
+def _is_absent(path: Path) -> bool:
+    """Whether there is certainly no file, unlike in a directory that may not be searched."""
+    try:
+        path.stat()
+    except FileNotFoundError:
+        return True
+    except OSError:
+        return False
+    return False
+
+
 class TolerantStore:
     """A `Store` whose `put` never raises: the first entry that cannot be written is reported to `notify`."""
 
@@ -30,9 +41,10 @@ class TolerantStore:
         self._path = store.path if path is None else path
 
     @classmethod
-    def open(cls, path: Path, notify: Callable[[str], None]) -> TolerantStore:
+    def open(cls, path: Path, notify: Callable[[str], None], *, for_display: bool = False) -> TolerantStore:
         """The file at `path`, for reading alone if it cannot be written; empty if there is none and it cannot be
-        created. Raises MeshctlError for a file that is no journal."""
+        created. Raises MeshctlError for a file that is no journal, and with `for_display` also if it is unknown
+        whether there is a file."""
         try:
             return cls(SqliteFile(path, SCHEMA), notify)
         except MeshctlError as error:
@@ -42,6 +54,8 @@ class TolerantStore:
                     found = SqliteFile(path, SCHEMA, read_only=True)
                 if found is None:
                     raise
+            elif for_display and not _is_absent(path):
+                raise
             opened = cls(found or SqliteFile(_IN_MEMORY, SCHEMA), notify, path)
             opened.report(error)
             return opened

@@ -22,7 +22,7 @@ from meshctl.inventory.compose import printable
 from meshctl.inventory.documents.node import NodeDocument
 from meshctl.inventory.fields import Name
 from meshctl.inventory.tree import Plain
-from meshctl.inventory.validate import expected_value
+from meshctl.inventory.validate import allowed_values, expected_value
 from meshctl.inventory.yaml_text import Value
 from meshctl.model import Fleet, Node, NodeState
 from meshctl.suggest import did_you_mean
@@ -49,6 +49,33 @@ _UNCLOSED = "unexpected end of data"
 # no two devices have the same one
 _IDENTIFIERS = ("label", "serial", "mac")
 _UNIQUE = (NODE, *_IDENTIFIERS)
+# headings of spreadsheets and of other programs' exports, and the columns that they mean
+_OTHER_HEADINGS = {
+    "name": NODE,
+    "device": NODE,
+    "device_name": NODE,
+    "host": NODE,
+    "hostname": NODE,
+    "node_name": NODE,
+    "asset_tag": "label",
+    "sticker": "label",
+    "serial_no": "serial",
+    "serial_number": "serial",
+    "s/n": "serial",
+    "sn": "serial",
+    "hardware_address": "mac",
+    "mac_addr": "mac",
+    "mac_address": "mac",
+    "status": "state",
+    "model": "hardware",
+    "device_type": "hardware",
+    "openwrt": "release",
+    "firmware": "release",
+    "ip": "address",
+    "ip_address": "address",
+    "ipv4_address": "address",
+    "location": "site",
+}
 _DELIMITERS = ",;\t"
 # MAC addresses as inventories, labels, barcodes and switches write them
 _MAC = re.compile(r"[0-9a-f]{2}(?:[:-]?[0-9a-f]{2}){5}|[0-9a-f]{4}(?:\.[0-9a-f]{4}){2}", re.IGNORECASE)
@@ -139,7 +166,7 @@ def edits(rows: Iterable[Row], fleet: Fleet, file: str, *, add: bool = False) ->
         values = {key: value for key, value in row.values.items() if key != NODE}
         place = Position(file, row.line)
         if node is not None:
-            changed = {key: value for key, value in values.items() if value != _GETTERS[key](node)}
+            changed = {key: value for key, value in values.items() if not _has(node, key, value)}
             if changed:
                 found.append(NodeEdit(node.name, row.line, False, _parsed(changed)))
         elif not (name or label):
@@ -158,10 +185,20 @@ def edits(rows: Iterable[Row], fleet: Fleet, file: str, *, add: bool = False) ->
     return tuple(found)
 
 
+def _has(node: Node, column: str, value: str) -> bool:
+    """Whether the node has this value already; an address may have its prefix length."""
+    return value == _GETTERS[column](node) or (column == "address" and value == str(node.address))
+
+
 def _unknown_or_taken(found: Iterable[NodeEdit], fleet: Fleet, file: str) -> Iterator[Diagnostic]:
-    """Sites that the inventory does not have, and identifiers that another node has after these edits."""
+    """Names that the inventory does not have, and identifiers and addresses that another node has after these edits."""
     edited = {edit.node: edit for edit in found}
     owners: dict[tuple[str, str], str] = {}
+    named: Mapping[str, tuple[str, Collection[str]]] = {
+        "site": ("site", fleet.sites),
+        "robot": ("robot", fleet.robots),
+        "hardware": ("hardware profile", fleet.hardware),
+    }
     for node in fleet.nodes.values():
         values = edited[node.name].values if node.name in edited else {}
         for column in _IDENTIFIERS:
@@ -170,15 +207,39 @@ def _unknown_or_taken(found: Iterable[NodeEdit], fleet: Fleet, file: str) -> Ite
                 owners[column, text.lower()] = node.name
     for edit in edited.values():
         place = Position(file, edit.line)
-        site = edit.values.get("site")
-        if site is not None and site not in fleet.sites:
-            expected = f"a site of the inventory ({join_limited(list(fleet.sites))})" if fleet.sites else "no site"
-            yield _wrong(place, "site", expected, f"'{printable(str(site))}'", did_you_mean(str(site), fleet.sites))
+        for column, (kind, known) in named.items():
+            name = str(edit.values.get(column, ""))
+            if name and name not in known:
+                expected = f"a {kind} of the inventory ({join_limited(list(known))})" if known else f"no {kind}"
+                yield _wrong(place, column, expected, f"'{printable(name)}'", did_you_mean(name, known))
         for column in _IDENTIFIERS:
             owner = owners.get((column, str(edit.values.get(column, "")).lower()))
             if owner is not None:
                 text = printable(str(edit.values[column]))
                 yield _wrong(place, column, "a value of one device", f"'{text}', which node {owner} has")
+    yield from _taken_addresses(edited, fleet, file)
+
+
+def _taken_addresses(edited: Mapping[str, NodeEdit], fleet: Fleet, file: str) -> Iterator[Diagnostic]:
+    """Addresses that another managed node has after these edits; those of lost and retired nodes are free."""
+    owners = {
+        str(node.address.ip): node.name
+        for node in fleet.managed()
+        if node.name not in edited or not {"address", "state"} & set(edited[node.name].values)
+    }
+    for edit in edited.values():
+        if not {"address", "state"} & set(edit.values):
+            continue
+        node = fleet.nodes.get(edit.node)
+        state = str(edit.values.get("state") or (NodeState.DEPLOYED if node is None else node.state).value)
+        own = "" if node is None else str(node.address.ip)
+        address = str(edit.values.get("address", own)).partition("/")[0]
+        if not address or not NodeState(state).is_managed:
+            continue
+        owner = owners.setdefault(address, edit.node)
+        if owner != edit.node:
+            found = f"'{printable(address)}', which node {owner} has"
+            yield _wrong(Position(file, edit.line), "address", "an address of one node", found)
 
 
 def _records(text: str, file: str) -> Iterator[tuple[int, list[str]]]:
@@ -216,10 +277,10 @@ def _columns(
         if heading in skipped or not heading:
             columns.append("")
         elif column not in COLUMNS:
-            meant = did_you_mean(column, COLUMNS)
-            ways = "map it with --column COLUMN=HEADING, or skip it with --ignore HEADING"
-            hint = f"{meant} If not, {ways}" if meant else ways
-            errors.append(_wrong(place, "", f"a column of {', '.join(COLUMNS)}", f"'{printable(cell.strip())}'", hint))
+            written = printable(cell.strip())
+            errors.append(
+                _wrong(place, "", f"a column of {', '.join(COLUMNS)}", f"'{written}'", _heading_hint(column, written))
+            )
         elif column in columns:
             errors.append(_wrong(place, column, "one column", "two"))
         else:
@@ -235,6 +296,15 @@ def _columns(
     if errors:
         raise InvalidInput(errors)
     return tuple(columns)
+
+
+def _heading_hint(column: str, written: str) -> str:
+    meant = _OTHER_HEADINGS.get(column, "")
+    if meant:
+        return f"""read it with --column "{meant}={written}", or skip it with --ignore "{written}\""""
+    similar = did_you_mean(column, COLUMNS)
+    ways = "map it with --column COLUMN=HEADING, or skip it with --ignore HEADING"
+    return f"{similar} If not, {ways}" if similar else ways
 
 
 def _normalized(column: str, cell: str) -> str:
@@ -265,7 +335,8 @@ def _errors_of(values: Mapping[str, str], place: Position) -> Iterator[Diagnosti
                 NodeDocument.model_validate({column: parts})
         except ValidationError as reason:
             (error, *_) = reason.errors(include_url=False, include_input=False)
-            yield _wrong(place, column, expected_value(error), f"'{printable(value)}'")
+            hint = did_you_mean(value, allowed_values(error))
+            yield _wrong(place, column, expected_value(error), f"'{printable(value)}'", hint)
 
 
 def _not_as_on_the_device(value: str) -> tuple[str, str] | None:

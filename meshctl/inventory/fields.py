@@ -74,7 +74,7 @@ def _name(value: str) -> str:
     if is_name(value):
         return value
     raise expected_error(
-        "a name of at most 63 letters, digits, '.', '_' and '-', starting and ending with a letter or digit"
+        "a name of at most 63 letters (a to z), digits, '.', '_' and '-', starting and ending with a letter or digit"
     )
 
 

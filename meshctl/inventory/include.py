@@ -159,7 +159,7 @@ class _FileMerger:
             problem = self.diagnostics[number]
             if problem.code == codes.UNREADABLE and problem.position.file == str(target):
                 self.diagnostics[number] = codes.error(
-                    codes.UNREADABLE, position(item), f"the include {target} {problem.message}"
+                    codes.UNREADABLE, position(item), f"the include {target} {problem.message}", hint=_hint(target)
                 )
 
     def _merge(self, root: MappingNode, below: MappingNode) -> None:
@@ -203,3 +203,8 @@ class _FileMerger:
 
 def _same_text(left: Tree, right: Tree) -> bool:
     return isinstance(left, Scalar) and isinstance(right, Scalar) and left.text == right.text
+
+
+def _hint(target: Path) -> str:
+    is_pattern = any(character in target.name for character in "*?[")
+    return "patterns are not expanded: list each file" if is_pattern else ""

@@ -214,7 +214,9 @@ class _LayerResolver:
             return ()
         wrong = next((name for name in names if not is_name(name)), None)
         if wrong is not None:
-            self._refuse(layer, f"'{printable(wrong)}' is not a name of at most 63 letters, digits, '.', '_' and '-'")
+            self._refuse(
+                layer, f"'{printable(wrong)}' is not a name of at most 63 letters (a to z), digits, '.', '_' and '-'"
+            )
             return ()
         return names
 

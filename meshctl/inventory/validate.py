@@ -61,6 +61,67 @@ _UNITS = {
     "_s": "seconds",
     "_tu": "time units of 1.024 ms",
 }
+# Names of keys in UCI, of other tools and of the field, and the keys that they mean where a mapping has them.
+_OTHER_NAMES: Mapping[str, tuple[str, ...]] = {
+    "authorized_keys": ("ssh_keys",),
+    "antenna_gain": ("antenna_gain_dbi",),
+    "bandwidth": ("htmode",),
+    "cell_id": ("bssid",),
+    "channel_width": ("htmode",),
+    "distance": ("distance_m",),
+    "essid": ("ssid",),
+    "gain": ("antenna_gain_dbi",),
+    "hop_limit": ("relay_hops",),
+    "ifname": ("lan_ports",),
+    "ip": ("address",),
+    "ipaddr": ("address",),
+    "ip_address": ("address",),
+    "mesh_id": ("ssid",),
+    "model": ("board",),
+    "name": ("hostname", "ssid"),
+    "ntp": ("ntp_servers",),
+    "ntp_server": ("ntp_servers",),
+    "passphrase": ("key",),
+    "password": ("key",),
+    "ports": ("lan_ports",),
+    "power": ("tx_power_dbm",),
+    "protocol": ("backend",),
+    "psk": ("key",),
+    "public_keys": ("ssh_keys",),
+    "regdomain": ("country",),
+    "routing": ("backend",),
+    "subnet": ("network",),
+    "syslog": ("log_host",),
+    "tags": ("groups",),
+    "tx_power": ("tx_power_dbm",),
+    "txpower": ("tx_power_dbm",),
+    "width": ("htmode",),
+}
+# Values in UCI's and the field's words, by key, and the values that they mean.
+_OTHER_VALUES: Mapping[str, Mapping[str, str]] = {
+    "mode": {"11s": "mesh", "802.11s": "mesh", "mesh point": "mesh", "meshpoint": "mesh", "ibss": "adhoc"},
+    "band": {"2.4": "2g", "2.4ghz": "2g", "5": "5g", "5ghz": "5g"},
+    "encryption": {
+        "open": "none",
+        "psk2": "psk2+ccmp",
+        "psk2+aes": "psk2+ccmp",
+        "wpa2": "psk2+ccmp",
+        "wpa2-psk": "psk2+ccmp",
+        "wpa3": "sae",
+    },
+    "backend": {"batman": "batman-adv", "batadv": "batman-adv", "bat0": "batman-adv"},
+    "role": {
+        "ap": "beacon",
+        "client": "beacon",
+        "gateway": "base",
+        "node": "beacon",
+        "relay": "beacon",
+        "repeater": "beacon",
+        "router": "beacon",
+        "station": "base",
+    },
+    "state": {"active": "deployed", "offline": "spare", "online": "deployed", "stored": "spare"},
+}
 # Keys whose values are shares of a whole.
 _SHARES = frozenset({"quorum", "duty_cycle", "scale"})
 _PERCENT = re.compile(r"([0-9]{1,3}(?:\.[0-9]{1,6})?) ?%?")
@@ -112,9 +173,11 @@ def _is_partial(root: MappingNode, path: tuple[int | str, ...]) -> bool:
 
 
 def _meant(wrong: str, known: Sequence[str]) -> tuple[str, ...]:
-    """The keys that an unknown one probably is: the same with its unit (`x` for `x_m`), else the most similar ones."""
+    """The keys that an unknown one probably is: the same with its unit (`x` for `x_m`), one with another name, else
+    the most similar ones."""
     with_unit = tuple(f"{wrong}{unit}" for unit in _UNITS if f"{wrong}{unit}" in known)
-    return with_unit or nearest(wrong, known)
+    renamed = tuple(key for key in _OTHER_NAMES.get(wrong.lower(), ()) if key in known)
+    return with_unit or renamed[:1] or nearest(wrong, known)
 
 
 def _diagnostic(root: MappingNode, error: ErrorDetails) -> Diagnostic:
@@ -132,6 +195,8 @@ def _diagnostic(root: MappingNode, error: ErrorDetails) -> Diagnostic:
         known = _known_keys(path[:-1])
         wrong = str(path[-1])
         hint = suggestion(_meant(wrong, known)) or f"known keys: {', '.join(known)}"
+        if wrong.startswith(("x-", ".")):
+            hint = "no key holds values for anchors alone: set the anchor (`&`) where its value is first used"
         if _is_rest_of_a_text(root, path):
             hint = "a comma ends a text within {}: if this belongs to the text before it, quote the whole text"
         return codes.error(codes.UNKNOWN_KEY, place, f"unknown key '{printable(wrong)}'", path=dotted, hint=hint)
@@ -214,10 +279,16 @@ def _entry_text(key: str, value: Tree) -> str:
     return f"{key}: {value.text}" if is_shown and isinstance(value, Scalar) else f"{key}: ..."
 
 
+def allowed_values(error: ErrorDetails) -> list[str]:
+    """The values that a field allows, if the error is a value that is none of them; else empty."""
+    expected = str(error.get("ctx", {}).get("expected", "")) if error["type"] == "enum" else ""
+    return [word for word in expected.split("'") if word.strip(", or")]
+
+
 def _enum_hint(root: MappingNode, path: tuple[int | str, ...], error: ErrorDetails) -> str:
     found = _found(root, path, "enum").strip("'")
-    known = [word for word in str(error.get("ctx", {}).get("expected", "")).split("'") if word.strip(", or")]
-    return did_you_mean(found, known)
+    meant = _OTHER_VALUES.get(str(path[-1]), {}).get(found.lower().replace(" ghz", "ghz"), "")
+    return suggestion((meant,)) if meant else did_you_mean(found, allowed_values(error))
 
 
 def _unit_hint(root: MappingNode, path: tuple[int | str, ...]) -> str:
@@ -233,6 +304,8 @@ def _unit_hint(root: MappingNode, path: tuple[int | str, ...]) -> str:
         return f"write a point: {tree.text.replace(',', '.')}"
     if tree.is_plain and tree.text.lower() in ("none", "no", "off") and path[-1] in ("gateway", "lan_filter", "mesh"):
         return "write `null` to remove the value of an earlier layer"
+    if path[-1] == "env" and tree.text.startswith("$"):
+        return "write the variable's name alone, without `$`"
     if not _WITH_UNIT.fullmatch(tree.text):
         return ""
     unit = next((unit for suffix, unit in _UNITS.items() if str(path[-1]).endswith(suffix)), "")

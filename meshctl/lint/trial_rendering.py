@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterator
+from collections.abc import Collection, Hashable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 from meshctl.diagnostics import InvalidInput
 from meshctl.model import Fleet, Node, Secret, SecretRef
 from meshctl.render import Rendered, Templates, render
-from meshctl.resolve import resolve
+from meshctl.resolve import resolve, resolve_unchecked
 
 Outcome = Rendered | InvalidInput | OSError
 
@@ -23,13 +24,21 @@ class TrialRendering:
     def __init__(self) -> None:
         self._fleet: Fleet | None = None
         self._outcomes: tuple[tuple[Node, Outcome], ...] = ()
+        self._parts: tuple[tuple[Node, Rendered], ...] | None = None
 
     def of(self, fleet: Fleet) -> tuple[tuple[Node, Outcome], ...]:
         """Every kind of node with own templates or options, and its files or the error that prevents rendering."""
         if self._fleet is not fleet:
             self._outcomes = tuple(_rendered(fleet))
-            self._fleet = fleet
+            self._fleet, self._parts = fleet, None
         return self._outcomes
+
+    def parts_of(self, fleet: Fleet) -> tuple[tuple[Node, Rendered], ...]:
+        """Those nodes with own options that do not render, without the options that prevent it, as far as possible."""
+        rendered = {node.name for node, outcome in self.of(fleet) if isinstance(outcome, Rendered)}
+        if self._parts is None:
+            self._parts = tuple(_parts(fleet, rendered))
+        return self._parts
 
 
 def placeholder(_ref: SecretRef) -> Secret:
@@ -81,6 +90,32 @@ def _rendered(fleet: Fleet) -> Iterator[tuple[Node, Outcome]]:
             yield node, render(intent, templates)
         except (InvalidInput, OSError) as error:
             yield node, error
+
+
+def _parts(fleet: Fleet, rendered: Collection[str]) -> Iterator[tuple[Node, Rendered]]:
+    nodes = [node for node in kinds(fleet) if node.extra_uci and node.name not in rendered]
+    if not nodes:
+        return
+    try:
+        templates = Templates.of(fleet)
+    except (InvalidInput, OSError):
+        return
+    for node in nodes:
+        intent, found = resolve_unchecked(fleet, node, placeholder)
+        # options of sections that are not created there fail when they are rendered
+        for _ in range(2):
+            wrong = {item.path.rpartition("extra_uci.")[2] for item in found}
+            options = {key: value for key, value in intent.extra_uci.items() if key not in wrong}
+            intent = replace(intent, extra_uci=options)
+            try:
+                part = render(intent, templates)
+            except InvalidInput as error:
+                found = error.diagnostics
+            except OSError:
+                break
+            else:
+                yield node, part
+                break
 
 
 def has_own_templates(fleet: Fleet) -> bool:

@@ -10,7 +10,7 @@ from meshctl.resolve.intervals import (
     batman_intervals,
     heal_s,
 )
-from meshctl.resolve.node import resolve
+from meshctl.resolve.node import resolve, resolve_unchecked
 from meshctl.resolve.packages import (
     FULL_SUPPLICANTS,
     PackageNeed,
@@ -50,6 +50,7 @@ __all__ = [
     "package_needs",
     "package_plan",
     "resolve",
+    "resolve_unchecked",
     "routes",
     "supplicant_need",
     "wireless_scripts",

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import fields
 
-from meshctl.diagnostics import InvalidInput
+from meshctl.diagnostics import Diagnostic, InvalidInput
 from meshctl.errors import InputError
 from meshctl.model import Backend, Encryption, Fleet, Mesh, Node, OperatorParts, Radio, Secret, SecretRef
 from meshctl.model.ip import IpNetwork
@@ -41,6 +41,17 @@ def resolve(fleet: Fleet, node: Node, secrets: Callable[[SecretRef], Secret]) ->
 
     Raises InvalidInput with all values that the node's files cannot contain (docs/render.md).
     """
+    intent, found = resolve_unchecked(fleet, node, secrets)
+    if found:
+        raise InvalidInput(found)
+    return intent
+
+
+def resolve_unchecked(
+    fleet: Fleet, node: Node, secrets: Callable[[SecretRef], Secret]
+) -> tuple[Intent, tuple[Diagnostic, ...]]:
+    """The configuration of `node` as written, with all values that its files cannot contain: for lint, never for a
+    node."""
     checks = ValueChecks(fleet)
     meshes = tuple(fleet.meshes[name] for name in node.meshes)
     primary = _primary(meshes, node)
@@ -86,9 +97,7 @@ def resolve(fleet: Fleet, node: Node, secrets: Callable[[SecretRef], Secret]) ->
         position=checks.position("nodes", node.name),
     )
     _check_values(fleet, node, intent, checks)
-    if checks.found:
-        raise InvalidInput(checks.found)
-    return intent
+    return intent, tuple(checks.found)
 
 
 def _check_backends(node: Node, meshes: tuple[Mesh, ...], checks: ValueChecks) -> None:

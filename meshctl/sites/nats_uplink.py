@@ -68,7 +68,10 @@ class NatsUplink(Uplink):
     def __init__(self, fleet: Fleet, site: Site, access: ConnectionPool, *, must_answer: bool = True) -> None:
         """Raises InputError, NatsLost, and with `must_answer` what `greeting` raises."""
         self.site = site
-        if fleet.nats is None or site.nats is None:
+        if site.nats is None:
+            hint = f"orders for {site.name} are sent over SSH, while it is online"
+            raise InputError(f"site {site.name} has no `nats`, so no order waits for it", hint=hint)
+        if fleet.nats is None:
             raise InputError(f"site {site.name} has `nats`, and the inventory has no hub", hint="set `nats.url`")
         if not site.worker_key:
             raise InputError(f"site {site.name} has no worker_key", hint=f"run `meshctl sites install {site.name}`")

@@ -40,7 +40,7 @@ CODES: Mapping[str, str] = MappingProxyType(
         "bridge": "a LAN port or the mesh is not in a bridge",
         "lan-filter": "its LAN filter is not loaded",
         "flash": "low on flash storage",
-        "change": "a change awaits confirmation or is being rolled back",
+        "change": "a change awaits confirmation or is being rolled back, or services still reload after a rollback",
         "locked": "locked by another operator",
         "foreign": "uncommitted changes were made by hand",
         # robots

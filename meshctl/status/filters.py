@@ -16,6 +16,7 @@ from meshctl.model import Fleet, NodeState, Role
 from meshctl.status.alarm_codes import CODES
 from meshctl.status.values import Alarm, FleetStatus, Level
 from meshctl.suggest import did_you_mean
+from meshctl.wording import join_limited
 
 ROLES = (*(role.value for role in Role), COMPUTER)
 STATES = tuple(state.value for state in NodeState if state.is_managed)
@@ -57,10 +58,12 @@ class Filter:
         )
 
     def apply(self, status: FleetStatus) -> FleetStatus:
-        """The status of the selected devices; a filter drops the alarms of the whole fleet."""
+        """The status of the selected devices. A filter drops the alarms of the whole fleet, except that selected robots
+        were not queried."""
         if self.is_empty:
             return status
-        return replace(self.devices_of(status), alarms=(), strangers=())
+        kept = tuple(alarm for alarm in status.alarms if self.robots and alarm.code == "robots-unasked")
+        return replace(self.devices_of(status), alarms=kept, strangers=())
 
     def _has_alarm(self, alarms: Iterable[Alarm]) -> bool:
         if not self.alarms:
@@ -88,7 +91,7 @@ def select_devices(
     known = (*CODES, *(level.text for level in Level), ANY_ALARM)
     for alarm in wanted:
         if alarm not in known:
-            hint = did_you_mean(alarm, known) or f"expected one of {', '.join(known[:MAX_HINT_NAMES])}"
+            hint = did_you_mean(alarm, known) or f"expected one of {join_limited(known, MAX_HINT_NAMES)}"
             raise InputError(f"no alarm of a status is called {alarm!r}", hint=hint)
     named = (tuple(f"{key}:{value}" for value in values) for key, values in (attributes or {}).items() if values)
     restrictions = [tuple(words), *((limit,) for limit in limits), *named]

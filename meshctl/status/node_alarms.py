@@ -216,6 +216,9 @@ def _changes(facts: NodeAlarmInput) -> Iterator[Alarm]:
         left = "" if change.left_s is None else f", {change.left_s:.0f} s left"
         text = f"a change by {lock_owners(change.owner) or 'an unknown owner'} is {change.state}{left}"
         yield Alarm(Level.WARNING, "change", text, "wait until it is confirmed or rolled back")
+    elif change is not None and change.is_reloading_restored:
+        text = "its services are still reloading after a rollback"
+        yield Alarm(Level.WARNING, "change", text, "wait until that has ended: it takes up to a minute")
     if change is not None and change.lock_owner and change.lock_owner != facts.own_lock:
         yield Alarm(Level.NOTE, "locked", f"locked by {lock_owners(change.lock_owner)}")
     if facts.observation.uci_changes:

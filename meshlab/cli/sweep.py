@@ -132,6 +132,7 @@ def study_of(file: Path) -> Study:
         partial(run_case, text, ground, str(file), identity.revision),
         partial(_check, text, ground, str(file)),
         SHOWN,
+        (file,) if place is None else (file, place),
     )
 
 

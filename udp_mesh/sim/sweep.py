@@ -71,6 +71,7 @@ def study_of(path: Path) -> Study:
         partial(run_case, text, str(path), identity.revision),
         partial(_check, text, str(path)),
         SHOWN,
+        (path,),
     )
 
 

@@ -48,6 +48,7 @@ def parse_status(stdout: str) -> ChangeStatus | None:
         last_outcome=values.get("last_outcome", ""),
         last_reason=values.get("last_reason", ""),
         version=values.get("version", ""),
+        is_reloading_restored=values.get("restored_reload") == "yes",
     )
 
 

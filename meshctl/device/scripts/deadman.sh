@@ -803,7 +803,8 @@ status() {
 	read -r last_id last_outcome last_reason _ 2>/dev/null <"$LAST"
 	read -r reloaded 2>/dev/null <"$RUN/reloaded"
 	now
-	state=$MARKER left='' due=''
+	state=$MARKER left='' due='' reloading=no
+	! is_reloading || reloading=yes
 	if [ "$MARKER" = armed ] && read -r due 2>/dev/null <"$TIMER/due"; then
 		state=waiting
 		as_seconds "$due"
@@ -814,7 +815,8 @@ status() {
 	as_seconds $NOW
 	echo "version=$VERSION state=$state id=$ID owner=$OWNER window_s=$WINDOW left_s=$left due_uptime_s=$due" \
 		"reload_status=$reloaded lock_owner=$LOCK_OWNER lock_left_s=$((LOCK_LEFT / 100))" \
-		"last_id=$last_id last_outcome=$last_outcome last_reason=$last_reason uptime_s=$SECONDS_TEXT"
+		"last_id=$last_id last_outcome=$last_outcome last_reason=$last_reason uptime_s=$SECONDS_TEXT" \
+		"restored_reload=$reloading"
 }
 
 umask 022

@@ -17,6 +17,8 @@ from meshctl.wording import join_limited
 
 # so many nodes of a mesh, and half of them, outside its network: the network is wrong, not each address
 _WRONG_NETWORK_NODES = 3
+# a network that is larger by more bits is not suggested: the addresses are wrong, not too many
+_MAX_MISSING_BITS = 4
 # address of a factory-fresh OpenWrt device
 _FACTORY = IPv4Address("192.168.1.1")
 # RFC 1123, and underscores, which some networks' own names have
@@ -41,9 +43,12 @@ def meshes_of(fleet: Fleet, node: Node) -> list[Mesh]:
 def address_twice(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     # by place: a range that overlaps another is one mistake
     at: dict[Position, dict[str, list[tuple[tuple[str, ...], str, IpAddress]]]] = {}
+    lans = _overlapping_lans(fleet)
     for address, owners in duplicates(stations(fleet)):
-        (_, first), *later = owners
+        (first_path, first), *later = owners
         for path, name in later:
+            if first_path[1] in lans and path[1] in lans and first_path[0] == path[0] == "robots":
+                continue  # MC216 reports the LANs
             at.setdefault(fleet.where(*path).position, {}).setdefault(first, []).append((path, name, address))
     for by_first in at.values():
         if len(by_first) == 1:
@@ -55,6 +60,12 @@ def address_twice(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
         message = f"{join_limited([name for _, name, _ in taken])} have the addresses of {join_limited(list(by_first))}"
         found = join_limited([str(address) for _, _, address in taken])
         yield Finding(taken[0][0], message, "unique addresses", found)
+
+
+def _overlapping_lans(fleet: Fleet) -> frozenset[str]:
+    """The robots whose LANs overlap that of another one."""
+    lans = ((robot.name, robot.lan) for robot in fleet.robots.values() if robot.lan is not None)
+    return frozenset(name for pair in overlaps(lans) for name, _ in pair)
 
 
 def stations(fleet: Fleet) -> Iterator[tuple[IpAddress, tuple[tuple[str, ...], str]]]:
@@ -106,7 +117,7 @@ def address_outside(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
         if name in wrong:
             # one typo in the network, rather than one in each address
             message = f"contains no address of {join_limited([node.name for node in nodes])}"
-            expected = f"a network with {nodes[0].address.ip}"
+            expected = _network_with(mesh.network, [node.address.ip for node in nodes])
             yield Finding(("meshes", name, "network"), message, expected, str(mesh.network))
             continue
         for node in nodes:
@@ -120,6 +131,18 @@ def address_outside(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
             message = f"{join_limited([node.name for node in nodes])} are outside their mesh's network"
         found = join_limited([str(node.address.ip) for node in nodes])
         yield Finding(("nodes", nodes[0].name, "address"), message, expected, found)
+
+
+def _network_with(network: IpNetwork, addresses: list[IpAddress]) -> str:
+    """The network that is expected instead: a larger one if addresses just exceed it, as those of a long range do."""
+    first, last = addresses[0], addresses[-1]
+    ends = f"{first} to {last}" if len(addresses) > 1 else f"{first}"
+    larger = network
+    while larger.prefixlen > max(network.prefixlen - _MAX_MISSING_BITS, 0):
+        larger = larger.supernet()
+        if all(address in larger for address in addresses):
+            return f"a network with {ends}, such as {larger}"
+    return f"a network with {first}"
 
 
 def _outside(fleet: Fleet) -> dict[str, list[Node]]:
@@ -168,8 +191,12 @@ def overlapping_meshes(fleet: Fleet) -> frozenset[str]:
     passing="nodes: {b01: {address: 10.42.0.254}}",
 )
 def address_reserved(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    # MC202 reports those outside, with the network that they are not in
+    outside = {node.name for nodes in _outside(fleet).values() for node in nodes}
+    wrong = wrong_networks(fleet)
     for node in fleet.managed():
-        yield from _reserved(("nodes", node.name, "address"), node.address)
+        if node.name not in outside and not wrong.intersection(node.meshes):
+            yield from _reserved(("nodes", node.name, "address"), node.address)
     for robot in fleet.robots.values():
         for place, _, computer in robot.all_computers():
             yield from _reserved(("robots", robot.name, *place, "address"), computer.address)

@@ -188,12 +188,13 @@ def confirm_window_long(fleet: Fleet, _context: LintContext) -> Iterator[Finding
     passing="hardware: {rocket: {lan_ports: [eth0, eth1]}}",
 )
 def port_twice(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    for place, ports in _port_lists(fleet):
+    for place, ports in port_lists(fleet):
         for port, indexes in duplicates((port, index) for index, port in enumerate(ports)):
             yield Finding((*place, str(indexes[1])), "listed twice", "each port once", port)
 
 
-def _port_lists(fleet: Fleet) -> Iterator[tuple[tuple[str, ...], tuple[str, ...]]]:
+def port_lists(fleet: Fleet) -> Iterator[tuple[tuple[str, ...], tuple[str, ...]]]:
+    """Each list of LAN ports, with the path of its key."""
     for profile in fleet.hardware.values():
         yield ("hardware", profile.name, "lan_ports"), profile.lan_ports
     for node in fleet.nodes.values():
@@ -212,7 +213,7 @@ def _port_lists(fleet: Fleet) -> Iterator[tuple[tuple[str, ...], tuple[str, ...]
     passing="hardware: {rocket: {lan_ports: [eth0]}}",
 )
 def port_of_mesh(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    for place, ports in _port_lists(fleet):
+    for place, ports in port_lists(fleet):
         for index, port in enumerate(ports):
             if port.startswith(_NOT_PORTS) or port == "lo":
                 yield Finding((*place, str(index)), "not a wired port", "a port such as eth0 or lan1", port)
@@ -228,7 +229,7 @@ def port_of_mesh(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     passing="hardware: {rocket: {lan_ports: [eth0.1, eth0.2], switch_vlans: {1: 3 0t, 2: 2 0t}}}",
 )
 def port_and_vlan(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    for place, ports in _port_lists(fleet):
+    for place, ports in port_lists(fleet):
         for index, port in enumerate(ports):
             parent, dot, _ = port.partition(".")
             if dot and parent in ports:

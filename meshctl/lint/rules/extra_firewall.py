@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
 from meshctl.lint.rule import Finding, fleet_rule
-from meshctl.lint.rules.rendering import created_sections, with_extra
+from meshctl.lint.rules.rendering import created_sections, with_parts
 from meshctl.model import Fleet
 from meshctl.uci import Package, Section
 
@@ -33,7 +33,7 @@ _UPLINK = """
     passing=_UPLINK,
 )
 def zone_taken(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
-    for node, packages in with_extra(fleet, context):
+    for node, packages in with_parts(fleet, context):
         firewall = packages.get("firewall")
         created = dict(created_sections(node, packages, "firewall"))
         own = [] if firewall is None else [zone for zone in firewall.of_type("zone") if zone.name not in created]
@@ -58,7 +58,7 @@ def zone_taken(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     passing=_UPLINK,
 )
 def uplink_open(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
-    for node, packages in with_extra(fleet, context):
+    for node, packages in with_parts(fleet, context):
         uplinks = {name for name, section in created_sections(node, packages, "network") if _is_uplink(section)}
         firewall = packages.get("firewall")
         if firewall is None or not uplinks:

@@ -1,4 +1,4 @@
-"""Further radios in extra_uci: the channels of access points; options of all packages with a typo (MC919 to MC920)."""
+"""Further radios in extra_uci: channels and powers of access points; options with a typo (MC919 to MC932)."""
 
 from __future__ import annotations
 
@@ -8,9 +8,16 @@ from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
 from meshctl.lint.openwrt_names import one_edit_apart
 from meshctl.lint.rule import Finding, fleet_rule
+from meshctl.lint.rules.power import (
+    ROUNDING_DB,
+    conducted_limit_dbm,
+    drive_path,
+    has_conducted_limit,
+    power_sum,
+)
 from meshctl.lint.rules.rendering import extra_entries, with_extra
-from meshctl.model import Fleet
-from meshctl.regdb import initiating_channels
+from meshctl.model import Fleet, Node, Radio
+from meshctl.regdb import CHANNELS, Country, check_span, initiating_channels, primary_span
 from meshctl.suggest import suggestion
 
 # the options that inventories set, by package and type of the section; others are compared with these only
@@ -125,3 +132,65 @@ def _meant(kind: tuple[str, str], option: str, known: frozenset[str]) -> tuple[s
 
 # the one type whose options depend on `proto`, and come from many packages
 _INTERFACE = ("network", "interface")
+
+
+@fleet_rule(
+    "MC932",
+    Severity.ERROR,
+    "The power of an access point exceeds the country's limit",
+    why="""A radio that is in no mesh and serves an access point transmits with `tx_power_dbm`, by default the driver's
+    maximum. The kernel limits only the drive level, so an amplifier or the antenna's gain can exceed the limit
+    unnoticed.""",
+    fix="Set the radio's `tx_power_dbm`, lower by the excess.",
+    failing="""
+    country: DE
+    hardware: {rocket: {radios: {radio1: {antenna_gain_dbi: 8}}}}
+    defaults: {radios: {radio0: {tx_power_dbm: 15}}}
+    nodes: {b01: {radios: {radio1: {tx_power_dbm: 20}}, extra_uci: {wireless.radio1.disabled: '0',
+      wireless.radio1.channel: '36', wireless.guest: wifi-iface, wireless.guest.device: radio1, wireless.guest.mode: ap,
+      wireless.guest.ssid: guests, wireless.guest.network: visitors, network.visitors: interface,
+      network.visitors.proto: none}}}
+    """,
+    passing="""
+    country: DE
+    hardware: {rocket: {radios: {radio1: {antenna_gain_dbi: 8}}}}
+    defaults: {radios: {radio0: {tx_power_dbm: 15}}}
+    nodes: {b01: {radios: {radio1: {tx_power_dbm: 15}}, extra_uci: {wireless.radio1.disabled: '0',
+      wireless.radio1.channel: '36', wireless.guest: wifi-iface, wireless.guest.device: radio1, wireless.guest.mode: ap,
+      wireless.guest.ssid: guests, wireless.guest.network: visitors, network.visitors: interface,
+      network.visitors.proto: none}}}
+    """,
+)
+def access_point_power(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
+    country = context.regdb.country(fleet.country)
+    for node, packages in with_extra(fleet, context):
+        wireless = packages.get("wireless")
+        if wireless is None or country is None:
+            continue
+        served = {iface.get("device") for iface in wireless.of_type("wifi-iface") if iface.get("disabled") != "1"}
+        for radio in node.radios:
+            section = wireless.section(radio.name)
+            is_on = section is not None and section.get("disabled") != "1" and radio.name in served
+            if section is None or not is_on or radio.mesh is not None:
+                continue
+            channel = section.get("channel")
+            if channel.isdigit() and int(channel) in CHANNELS[radio.hardware.band]:
+                yield from _above_limit(fleet, country, node, radio, int(channel))
+
+
+def _above_limit(fleet: Fleet, country: Country, node: Node, radio: Radio, channel: int) -> Iterator[Finding]:
+    band, gain = radio.hardware.band, radio.hardware.antenna_gain_dbi
+    if has_conducted_limit(fleet.country, band, channel):
+        limit, power, kind = conducted_limit_dbm(gain), radio.conducted_dbm, "conducted"
+        total = f"{power_sum(radio)} = {power:g} dBm"
+    else:
+        legality = check_span(country, primary_span(band, channel))
+        if not legality.covered:
+            return  # MC919 reports the channel
+        limit, power, kind = legality.max_eirp_dbm, radio.eirp_dbm, "EIRP"
+        total = f"{power_sum(radio)} + {gain:g} antenna = {power:g} dBm EIRP"
+    if power > limit + ROUNDING_DB:
+        expected = f"at most {limit:g} dBm {kind} (country {country.alpha2}, channel {channel})"
+        yield Finding(
+            drive_path(fleet, node, radio), f"{round(power - limit, 2):g} dB above the limit", expected, total
+        )

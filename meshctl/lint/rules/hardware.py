@@ -133,8 +133,8 @@ def package_contradiction(fleet: Fleet, _context: LintContext) -> Iterator[Findi
     Severity.WARNING,
     "Board and profile name different devices",
     why="""`board` is the device's own name, `profile` the ImageBuilder's: the same words with a comma or an underscore.
-    If they differ, one was probably copied from another profile, and the image will be rejected. With an underscore in
-    place of its comma, a board is that of no device, and `plan` refuses every node.""",
+    If they differ, one was probably copied from another profile, and the image will be rejected. Without the comma
+    after its vendor, a board is that of no device, and `plan` refuses every node.""",
     fix="Correct `board` or `profile`; `ubus call system board` on the device prints its board.",
     failing="hardware: {rocket: {profile: ubnt_bullet-m-xw}}",
     passing="hardware: {rocket: {profile: ubnt_rocket-m}}",
@@ -143,13 +143,13 @@ def board_and_profile_differ(fleet: Fleet, _context: LintContext) -> Iterator[Fi
     for profile in fleet.hardware.values():
         if profile.target.partition("/")[0] in _OTHER_PROFILE_NAMES:
             continue
-        if profile.board.replace(",", "_") != profile.profile:
+        if "," not in profile.board and "_" in profile.profile:
+            path = ("hardware", profile.name, "board")
+            yield Finding(path, "no comma after the vendor", profile.profile.replace("_", ",", 1), profile.board)
+        elif profile.board.replace(",", "_") != profile.profile:
             path = ("hardware", profile.name, "profile")
             expected = f"{profile.board.replace(',', '_')} for board {profile.board}"
             yield Finding(path, "does not match the board", expected, profile.profile)
-        elif "_" in profile.board and "," not in profile.board:
-            path = ("hardware", profile.name, "board")
-            yield Finding(path, "the name of the image's profile", profile.board.replace("_", ",", 1), profile.board)
 
 
 @fleet_rule(

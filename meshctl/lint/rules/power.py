@@ -9,7 +9,7 @@ from meshctl.lint.context import LintContext
 from meshctl.lint.grouping import group_by_key
 from meshctl.lint.places import first_written
 from meshctl.lint.rule import Finding, fleet_rule
-from meshctl.model import AntennaKind, Fleet, Mesh, Node, Radio
+from meshctl.model import AntennaKind, Band, Fleet, Mesh, Node, Radio
 from meshctl.regdb import CHANNELS, check_span, primary_span
 
 # below this, a radio reaches the next room; 0 is "automatic" in other firmware
@@ -20,7 +20,7 @@ _FREE_GAIN_DBI = 6.0
 _CONDUCTED_COUNTRIES = frozenset({"US", "AS", "CA", "GU", "MP", "PR", "VI"})
 _CONDUCTED_BANDS_MHZ = ((2400.0, 2483.5), (5725.0, 5850.0))
 # drive levels are whole dBm, and the database rounds to tenths of a mW
-_ROUNDING_DB = 0.05
+ROUNDING_DB = 0.05
 # beyond this difference a link loses acknowledgments long before data
 _ASYMMETRY_DB = 10.0
 # ratings are often rounded up: "1 W" can mean 28 dBm
@@ -56,13 +56,18 @@ def _transmitting(fleet: Fleet) -> Iterator[tuple[Node, Radio, Mesh]]:
 
 
 def _has_conducted_limit(fleet: Fleet, mesh: Mesh) -> bool:
-    span = primary_span(mesh.band, mesh.channel)
-    return fleet.country in _CONDUCTED_COUNTRIES and any(
+    return has_conducted_limit(fleet.country, mesh.band, mesh.channel)
+
+
+def has_conducted_limit(country: str, band: Band, channel: int) -> bool:
+    """Whether the limit is that of the power into the antenna."""
+    span = primary_span(band, channel)
+    return country in _CONDUCTED_COUNTRIES and any(
         low <= span.low_mhz and span.high_mhz <= high for low, high in _CONDUCTED_BANDS_MHZ
     )
 
 
-def _drive_path(fleet: Fleet, node: Node, radio: Radio) -> tuple[str, ...]:
+def drive_path(fleet: Fleet, node: Node, radio: Radio) -> tuple[str, ...]:
     """The path that sets the drive level: the node's layers, or else the driver's maximum."""
     written = ("nodes", node.name, "radios", radio.name, "tx_power_dbm")
     return first_written(fleet, written, ("hardware", node.hardware.name, "radios", radio.name, "max_drive_dbm"))
@@ -93,14 +98,14 @@ def eirp_above_country(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     }
     for node, radio, mesh in _transmitting(fleet):
         verdict = limits.get(mesh.name)
-        if verdict is None or not verdict.covered or radio.eirp_dbm <= verdict.max_eirp_dbm + _ROUNDING_DB:
+        if verdict is None or not verdict.covered or radio.eirp_dbm <= verdict.max_eirp_dbm + ROUNDING_DB:
             continue
         total = (
             f"{power_sum(radio)} + {_dbm(radio.hardware.antenna_gain_dbi)} antenna = {_dbm(radio.eirp_dbm)} dBm EIRP"
         )
         excess = radio.eirp_dbm - verdict.max_eirp_dbm
         expected = f"at most {_dbm(verdict.max_eirp_dbm)} dBm EIRP (country {country.alpha2}, channel {mesh.channel})"
-        yield Finding(_drive_path(fleet, node, radio), f"{_dbm(round(excess, 2))} dB above the limit", expected, total)
+        yield Finding(drive_path(fleet, node, radio), f"{_dbm(round(excess, 2))} dB above the limit", expected, total)
 
 
 @fleet_rule(
@@ -125,14 +130,19 @@ def conducted_above_fcc(fleet: Fleet, _context: LintContext) -> Iterator[Finding
     for node, radio, mesh in _transmitting(fleet):
         gain = radio.hardware.antenna_gain_dbi
         excess_gain = max(gain - _FREE_GAIN_DBI, 0.0)
-        limit = _CONDUCTED_LIMIT_DBM - excess_gain
-        if mesh.name not in limited or radio.conducted_dbm <= limit + _ROUNDING_DB:
+        limit = conducted_limit_dbm(gain)
+        if mesh.name not in limited or radio.conducted_dbm <= limit + ROUNDING_DB:
             continue
         excess = radio.conducted_dbm - limit
         less = f": 30 less {_dbm(excess_gain)} for an antenna of {_dbm(gain)} dBi" if excess_gain else ""
         allowed = f"at most {_dbm(limit)} dBm conducted (country {fleet.country}{less})"
         total = f"{power_sum(radio)} = {_dbm(radio.conducted_dbm)} dBm"
-        yield Finding(_drive_path(fleet, node, radio), f"{_dbm(round(excess, 2))} dB above the limit", allowed, total)
+        yield Finding(drive_path(fleet, node, radio), f"{_dbm(round(excess, 2))} dB above the limit", allowed, total)
+
+
+def conducted_limit_dbm(gain_dbi: float) -> float:
+    """The limit behind an antenna of this gain."""
+    return _CONDUCTED_LIMIT_DBM - max(gain_dbi - _FREE_GAIN_DBI, 0.0)
 
 
 def _is_limited(fleet: Fleet, mesh: Mesh) -> bool:
@@ -153,7 +163,7 @@ def drive_above_driver(fleet: Fleet, _context: LintContext) -> Iterator[Finding]
         if radio.tx_power_dbm > radio.hardware.max_drive_dbm:
             expected = f"at most {radio.hardware.max_drive_dbm} (hardware {node.hardware.name})"
             yield Finding(
-                _drive_path(fleet, node, radio), "above the driver's maximum", expected, str(radio.tx_power_dbm)
+                drive_path(fleet, node, radio), "above the driver's maximum", expected, str(radio.tx_power_dbm)
             )
 
 
@@ -177,10 +187,10 @@ def amplifier_overdriven(fleet: Fleet, _context: LintContext) -> Iterator[Findin
     for node, radio, _ in _transmitting(fleet):
         hardware = radio.hardware
         driven = radio.tx_power_dbm + hardware.amplifier_gain_db
-        if radio.tx_power_dbm <= hardware.max_drive_dbm and driven > hardware.rated_power_dbm + _ROUNDING_DB:
+        if radio.tx_power_dbm <= hardware.max_drive_dbm and driven > hardware.rated_power_dbm + ROUNDING_DB:
             found = f"{radio.tx_power_dbm} drive + {_dbm(hardware.amplifier_gain_db)} amplifier = {_dbm(driven)} dBm"
             expected = f"at most {_dbm(hardware.rated_power_dbm)} dBm (hardware {node.hardware.name})"
-            yield Finding(_drive_path(fleet, node, radio), "above the hardware's rating", expected, found)
+            yield Finding(drive_path(fleet, node, radio), "above the hardware's rating", expected, found)
 
 
 @fleet_rule(
@@ -279,7 +289,7 @@ def powers_far_apart(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
                 expected = f"at least {_dbm(strong.conducted_dbm - _ASYMMETRY_DB)} dBm conducted"
                 message = f"{strongest.name} in mesh {name} transmits {_dbm(strong.conducted_dbm)} dBm"
                 found = f"{_dbm(radio.conducted_dbm)} dBm"
-                yield Finding(_drive_path(fleet, node, radio), message, expected, found)
+                yield Finding(drive_path(fleet, node, radio), message, expected, found)
 
 
 @fleet_rule(
@@ -322,5 +332,5 @@ def power_nearly_nothing(fleet: Fleet, _context: LintContext) -> Iterator[Findin
                 yield Finding(rating, "2 W is 33 dBm", expected, f"{_dbm(built_in.rated_power_dbm)} dBm")
     for node, radio, _ in _transmitting(fleet):
         if radio.tx_power_dbm + radio.hardware.amplifier_gain_db < _LEAST_DBM:
-            path = _drive_path(fleet, node, radio)
+            path = drive_path(fleet, node, radio)
             yield Finding(path, "hardly anything hears it", expected, f"{radio.tx_power_dbm} dBm")

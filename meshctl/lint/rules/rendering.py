@@ -214,6 +214,14 @@ def with_extra(fleet: Fleet, context: LintContext) -> Iterator[tuple[Node, dict[
             yield node, {file.package.name: file.package for file in outcome.files if file.package is not None}
 
 
+def with_parts(fleet: Fleet, context: LintContext) -> Iterator[tuple[Node, dict[str, uci.Package]]]:
+    """As `with_extra`; of nodes that do not render, without the options that prevent it. For rules about what a package
+    contains: what it lacks may be such an option."""
+    yield from with_extra(fleet, context)
+    for node, part in context.trial.parts_of(fleet):
+        yield node, {file.package.name: file.package for file in part.files if file.package is not None}
+
+
 def created_sections(
     node: Node, packages: Mapping[str, uci.Package], package: str
 ) -> Iterator[tuple[str, uci.Section]]:

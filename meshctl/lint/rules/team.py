@@ -251,25 +251,30 @@ def carried_by_nobody(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
 
 @fleet_rule(
     "MC609",
-    Severity.ERROR,
+    Severity.WARNING,
     "A robot has no radio",
-    why="Without a managed node the robot is unreachable and cannot be stopped.",
-    fix="""List its radio under `nodes`; a lost node does not count. A robot that a further link of another robot's
-    computer (`links`) reaches needs none.""",
+    why="""Without a managed node, nothing is known about the robot's way into the mesh: plans and `status` do not see
+    what a change or a failure cuts off, and if it has no other way, it cannot be stopped.""",
+    fix="""List its radio under `nodes`; a lost node does not count. None is needed by a robot that another one names in
+    `relay` or reaches by a further link of its computer (`links`), one with a thin link (`thin`), and a legacy one
+    (`fielded`). If its radio is not managed by meshctl, suppress this finding.""",
     failing="""
     nodes: {husky1-front: {state: lost}}
     """,
     passing="nodes: {husky1-front: {state: carried}}",
 )
 def robot_without_radio(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    linked = behind_further_links(fleet)
+    linked = behind_further_links(fleet) | {name for robot in fleet.robots.values() for name in robot.relay}
     for robot in fleet.robots.values():
         known = [fleet.nodes[name] for name in robot.nodes if name in fleet.nodes]
-        if not robot.nodes and robot.name in linked:
+        is_reached_otherwise = robot.name in linked or robot.thin is not None or robot.fielded is not None
+        if not robot.nodes and is_reached_otherwise:
             continue
         if len(known) == len(robot.nodes) and not any(node.state.is_managed for node in known):
             found = join_limited([f"{node.name} ({node.state.value})" for node in known]) or "none"
-            yield Finding(("robots", robot.name), "no radio is in use", "at least one managed node", found)
+            base = fleet.base_node if robot.is_base else None
+            expected = f"the base's radio, {base.name}" if base is not None else "at least one managed node"
+            yield Finding(("robots", robot.name), "no radio is in use", expected, found)
 
 
 @fleet_rule(

@@ -109,6 +109,15 @@ class TextfileWriter:
             self.problem = ""
 
 
+def check_textfile(path: Path) -> None:
+    """Raises InputError for a name that node_exporter's textfile collector does not read."""
+    if path.suffix != ".prom":
+        raise InputError(f"--textfile: expected a file name that ends in .prom, found {path}", hint=_TEXTFILE_HINT)
+
+
+_TEXTFILE_HINT = "node_exporter reads no other files; without --textfile, `meshctl metrics` prints to standard output"
+
+
 def replace_file(path: Path, text: str) -> None:
     """Write a file that others read at any time: they see the old text or the new one. Raises InputError.
 

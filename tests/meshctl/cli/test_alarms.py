@@ -117,6 +117,10 @@ def test_metrics_of_a_history_and_the_files_for_prometheus(
         capfd, "metrics", "--store", store, "--textfile", str(tmp_path / "no" / "x.prom"), code=2
     )
     assert "expected one of" in said(capfd, "metrics", "--rules", "--dashboard", code=2)
+    for command in ("metrics", "monitor"):
+        text = said(capfd, command, "-i", inventory, "--textfile", str(tmp_path / "fleet.txt"), code=2)
+        assert "expected a file name that ends in .prom" in text
+        assert not (tmp_path / "fleet.txt").exists()
 
 
 def test_targets_name_the_robots_that_are_none_on_standard_error(

@@ -153,3 +153,17 @@ def test_the_runs_of_a_lab_are_those_of_this_computer_where_operators_share_a_jo
             main(["history", *words])
         assert ended.value.code == 2
         assert "MESHCTL_STORE: expected postgresql://" in capfd.readouterr().err
+
+
+def test_a_journal_that_cannot_be_looked_up_is_not_called_empty(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    assert said(capfd) == "no runs yet\n"
+    (tmp_path / "loop").symlink_to("loop")
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "loop"))
+    with pytest.raises(SystemExit) as ended:
+        main(["history"])
+    output = capfd.readouterr()
+    assert (ended.value.code, output.out) == (2, "")
+    assert "cannot open the journal" in output.err

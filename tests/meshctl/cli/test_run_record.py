@@ -101,3 +101,27 @@ def test_a_finished_run_of_any_kind_has_nothing_to_resume(
     with pytest.raises(SystemExit) as ended:
         main(["resume", "-i", str(inventory)])
     assert (ended.value.code, capsys.readouterr().out) == (0, "run 1 is finished: nothing to resume\n")
+
+
+def test_the_last_run_to_resume_is_the_latest_unfinished_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    inventory = tmp_path / "fleet.yaml"
+    inventory.write_text(HEAD, encoding="utf-8")
+    with Journal(tmp_path / "meshctl/journal.sqlite") as journal:
+        for node, result in (("a", Result.PENDING), ("b", Result.DONE)):
+            run = journal.begin("provision", fleet="trial", inventory="inv", nodes=(node,))
+            run.finish_node(Outcome(node, result))
+            run.end("ended")
+    for words in (["last"], []):
+        with pytest.raises(SystemExit) as ended:
+            main(["resume", *words, "-i", str(inventory)])
+        said = capsys.readouterr()
+        # the inventory has no node `a`
+        assert (ended.value.code, said.out) == (0, "run 1 is finished: nothing to resume\n")
+        assert "no longer manages: a" in said.err
+    with pytest.raises(SystemExit) as ended:
+        main(["resume", "b03", "-i", str(inventory)])
+    assert ended.value.code == 2
+    assert "expected the number of a run, or `last`, found b03" in capsys.readouterr().err

@@ -337,6 +337,7 @@ def test_no_change_is_staged_while_a_rollback_reloads(node: Sandbox) -> None:
     eventually(lambda: (node.text("/harness/log") or "") == "begin\n" and node.path("/harness/first").exists())
     node.deadman("abort", OWNER, "c1")
     eventually(lambda: (node.text("/harness/log") or "") == "begin\nbegin\n")
+    assert re.search(r" state=idle .* restored_reload=yes", node.deadman("status"))
     prepare(node)
     switch = "/usr/sbin/meshctl-deadman"
     node.put("/harness/hasty", (node.text(switch) or "").replace("RESTORED_WAIT_CS=2000", "RESTORED_WAIT_CS=20"), 0o755)
@@ -346,6 +347,7 @@ def test_no_change_is_staged_while_a_rollback_reloads(node: Sandbox) -> None:
         waiting = hand.submit(node.deadman, "stage", OWNER, "c1", BUNDLE)
         node.put("/harness/go", "")
         assert waiting.result() == "ok state=staged id=c1"
+    assert " restored_reload=no" in node.deadman("status")
 
 
 def test_a_foreign_process_under_the_number_of_a_killed_rollback_holds_no_change_off(node: Sandbox) -> None:

@@ -117,6 +117,7 @@ def test_known_nodes_change_and_new_ones_are_added_on_request(api: ThreadingHTTP
     assert (str(new.address.ip), new.mac) == ("10.42.0.77", "02:00:5e:00:00:09")
     assert set(after.nodes) == {*load_fleet(shipped("inventory") / "subt-final").nodes, "roof"}
     again = run(api, fleet, "--add", "--json")
+    assert "left out: 1 device without a name in NetBox" in again.stderr
     assert json.loads(again.stdout)["nodes"] == []
 
 

@@ -194,6 +194,59 @@ def test_a_site_and_an_identifier_that_a_table_cannot_give_are_errors(inventory:
     assert load_fleet(inventory).nodes["husky1-b01"].serial == "S1"
 
 
+def test_a_robot_a_hardware_and_an_address_that_a_table_cannot_give_are_errors(inventory: Path) -> None:
+    before = load_fleet(inventory)
+    taken = before.nodes["husky1-b01"].address.ip
+    rows = read(
+        f"node,robot,hardware,address,state\nbase,husky11,,,\nhusky1-b02,,Rocket,,\nhusky1-b03,,,{taken},\n",
+        "boxes.csv",
+    )
+    with pytest.raises(InvalidInput) as raised:
+        edits(rows, before, "boxes.csv")
+    robot, hardware, address = map(str, raised.value.diagnostics)
+    assert "boxes.csv:2: robot: expected a robot of the inventory (base-station, husky1, " in robot
+    assert "found 'husky11' [INV040]" in robot
+    assert raised.value.diagnostics[0].hint == "did you mean 'husky1'?"
+    assert "boxes.csv:3: hardware: expected a hardware profile of the inventory (" in hardware
+    assert (
+        f"boxes.csv:4: address: expected an address of one node, found '{taken}', which node husky1-b01 has" in address
+    )
+    # two nodes swap addresses, or a lost one leaves its own to another
+    other = before.nodes["husky1-b02"].address.ip
+    assert edits(read(f"node,address\nhusky1-b01,{other}\nhusky1-b02,{taken}\n", "x"), before, "x")
+    assert edits(read(f"node,address,state\nhusky1-b01,,lost\nhusky1-b02,{taken},\n", "x"), before, "x")
+    both = read(f"node,address\nhusky1-b01,{other}\n", "x")
+    with pytest.raises(InvalidInput, match="which node husky1-b02 has"):
+        edits(both, before, "x")
+
+
+@pytest.mark.parametrize(
+    ("heading", "hint"),
+    [
+        ("MAC address", 'read it with --column "mac=MAC address", or skip it with --ignore "MAC address"'),
+        ("Serial number", 'read it with --column "serial=Serial number"'),
+        ("IP", 'read it with --column "address=IP"'),
+    ],
+)
+def test_a_usual_heading_is_mapped_to_its_column(heading: str, hint: str) -> None:
+    with pytest.raises(InvalidInput) as raised:
+        read(f"node,{heading}\nbase,x\n", "boxes.csv")
+    assert raised.value.diagnostics[0].hint.startswith(hint)
+
+
+def test_an_address_with_its_prefix_length_is_no_change(inventory: Path) -> None:
+    fleet = load_fleet(inventory)
+    same = fleet.nodes["husky1-b01"].address
+    assert edits(read(f"node,address\nhusky1-b01,{same}\n", "x"), fleet, "x") == ()
+    assert edits(read(f"node,address\nhusky1-b01,{same.ip}/16\n", "x"), fleet, "x") != ()
+
+
+def test_a_value_in_another_case_has_a_hint() -> None:
+    with pytest.raises(InvalidInput) as raised:
+        read("node,state\nbase,Deployed\n", "boxes.csv")
+    assert raised.value.diagnostics[0].hint == "did you mean 'deployed'?"
+
+
 def test_a_table_in_another_encoding_names_the_line(inventory: Path, tmp_path: Path) -> None:
     (tmp_path / "boxes.csv").write_bytes("node,label\nbase,B\nhusky1-b01,Käfer\n".encode("latin-1"))
     words = ["inventory", "import", str(tmp_path / "boxes.csv"), "-i", str(inventory)]

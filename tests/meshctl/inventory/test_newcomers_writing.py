@@ -32,6 +32,23 @@ def _errors(old: str, new: str, directory: Path) -> list[Diagnostic]:
             "write `null` to remove the value of an earlier layer",
         ),
         ("base: {role: base,", "base: {role: base, position: {x: 1, y_m: 2},", "did you mean 'x_m'?"),
+        ("ssid: my-fleet", "mesh_id: my-fleet", "did you mean 'ssid'?"),
+        ("base: {role: base, address:", "base: {role: base, ipaddr:", "did you mean 'address'?"),
+        ("htmode: HT20", "width: HT20", "did you mean 'htmode'?"),
+        ("mode: adhoc", "mode: ibss", "did you mean 'adhoc'?"),
+        ("band: 2g\n", "band: 2.4 GHz\n", "did you mean '2g'?"),
+        ("base: {role: base,", "base: {role: gateway,", "did you mean 'base'?"),
+        (
+            "encryption: none ",
+            "encryption: psk2+ccmp\n    key: {env: $MESH_KEY}\n    # ",
+            "write the variable's name alone, without `$`",
+        ),
+        (
+            "hardware:\n",
+            "x-packages: &packages [iw]\nhardware:\n",
+            "no key holds values for anchors alone: set the anchor (`&`) where its value is first used",
+        ),
+        ("# include: [topics.yaml]", 'include: ["*.yaml"]', "patterns are not expanded: list each file"),
         ('carries: ["rover1-b[01-06]"]', "carries: [rover1-b[01-06]]", 'quote a range in a list: ["b[01-12]"]'),
         (
             "base: {role: base,",

@@ -207,3 +207,10 @@ def test_a_machine_without_a_regulatory_database_is_reported(
     assert "using the bundled wireless-regdb " in capsys.readouterr().err
     assert _lint("clean.yaml", "--regdb", str(SHIPPED)) == 0
     assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize("words", [["--out"], ["--write-baseline", "--baseline"]])
+def test_a_report_does_not_overwrite_the_inventory(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert _lint(_file("fleet.yaml", BASE), *words, "./fleet.yaml") == 2
+    assert "is a file of the inventory, and would be overwritten" in capsys.readouterr().err
+    assert Path("fleet.yaml").read_text(encoding="utf-8") == BASE

@@ -45,6 +45,28 @@ def _found(changes: dict[str, str | None], directory: Path) -> list[Diagnostic]:
     return [one for one in found if one.code.startswith(("MC9", "MC529"))]
 
 
+@pytest.mark.parametrize(
+    ("wrong", "code"),
+    [
+        ({"wireless.radio0 .rts": "500"}, "MC903"),
+        ({"network.nosuch.mtu": "1400"}, "MC901"),
+    ],
+)
+def test_an_open_uplink_is_reported_beside_an_option_that_prevents_rendering(
+    wrong: dict[str, str | None], code: str, tmp_path: Path
+) -> None:
+    found = _found({"firewall.wan.input": "ACCEPT", **wrong}, tmp_path)
+    assert [one.code for one in found if one.code in (code, "MC930")] == ["MC930", code]
+
+
+def test_an_open_uplink_is_reported_beside_a_mesh_that_prevents_rendering(tmp_path: Path) -> None:
+    options = "".join(f"      {key}: {value!r}\n" for key, value in {**_SOUND, "firewall.wan.input": "ACCEPT"}.items())
+    example = Example(f'meshes: {{main: {{ssid: "a\\tb"}}}}\nnodes:\n  b01:\n    extra_uci:\n{options}')
+    found = [one.code for one in check_path(write(example, tmp_path), _REGDB, environment(example)).diagnostics]
+    assert "MC930" in found
+    assert len(found) > 1
+
+
 def test_an_uplink_and_an_office_are_sound(tmp_path: Path) -> None:
     assert _found({}, tmp_path) == []
 

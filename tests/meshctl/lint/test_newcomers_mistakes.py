@@ -260,3 +260,34 @@ def test_the_controller_of_a_pci_radio_tells_the_chip(path: str, target: str, tm
     (tmp_path / "right").mkdir()
     right = fragment.replace("radios:", f"target: {target or 'ath79/generic'}, radios:")
     assert [one for one in _found(right, tmp_path / "right") if one.code == "MC834"] == []
+
+
+def test_a_network_that_is_too_small_for_a_range_is_one_finding(tmp_path: Path) -> None:
+    """Addresses that end in 0 and 255 outside the network were reported, too."""
+    fragment = """
+    meshes: {main: {network: 10.42.0.0/25}}
+    nodes: {"n[001-200]": {address: {from: 10.42.0.120}}}
+    """
+    found = [one for one in _found(fragment, tmp_path) if one.code in ("MC202", "MC203")]
+    assert [(one.code, one.path) for one in found] == [("MC202", "meshes.main.network")]
+    assert found[0].expected == "a network with 10.42.0.128 to 10.42.1.63, such as 10.42.0.0/23"
+
+
+def test_two_robots_with_one_lan_are_one_finding(tmp_path: Path) -> None:
+    """The routers' and the computers' addresses, which are equal because the LANs are, were reported, too."""
+    fragment = """
+    nodes: {husky2-front: {role: robot, address: 10.42.0.12}}
+    robots:
+      base-station: {computer: {gateway: 10.42.0.1}}
+      husky1: {lan: {network: 10.43.1.0/24}, computer: {address: 10.43.1.10/24}}
+      husky2: {nodes: [husky2-front], lan: {network: 10.43.1.0/24}, computer: {address: 10.43.1.10/24}}
+    """
+    found = [one for one in _found(fragment, tmp_path) if one.code in ("MC201", "MC216")]
+    assert [(one.code, one.path) for one in found] == [("MC216", "robots.husky2.lan.network")]
+
+
+def test_a_board_without_its_vendor_is_reported_at_the_board(tmp_path: Path) -> None:
+    """The profile was expected to be `tl-wr841n-v9`."""
+    names = "board: tl-wr841-v9, profile: tplink_tl-wr841-v9"
+    (finding,) = [one for one in _found(f"hardware: {{rocket: {{{names}}}}}", tmp_path) if one.code == "MC825"]
+    assert (finding.path, finding.expected) == ("hardware.rocket.board", "tplink,tl-wr841-v9")

@@ -123,3 +123,22 @@ def test_a_robot_without_a_radio_in_the_network_of_the_mesh_still_lacks_one(tmp_
       uav1: {computer: {address: 10.42.0.120/24, ssh: {user: robot}}}
     """
     assert [item.path for item in _found(text, tmp_path)[0] if item.code == "MC609"] == ["robots.uav1"]
+
+
+@pytest.mark.parametrize(
+    "uav",
+    [
+        "husky1: {relay: [uav1]}, uav1: {computer: {address: 10.42.0.120/24, ssh: {user: robot}}}",
+        "uav1: {fielded: 10.42.0.120}",
+        "uav1: {computer: {address: 10.42.0.120/24}, thin: {number: 2, ports: {lora: /dev/ttyUSB0}}}",
+    ],
+)
+def test_a_robot_that_is_reached_otherwise_needs_no_radio(uav: str, tmp_path: Path) -> None:
+    """The guide to relays has such a UAV."""
+    text = f"robots: {{{uav}}}\nudp_mesh: {{thin_links: {{lora: {{bits_per_s: 5470, frame_bytes: 120, band: eu868}}}}}}"
+    assert "MC609" not in [item.code for item in _found(text, tmp_path)[0]]
+
+
+def test_a_base_station_without_its_radio_is_shown_which_one_it_is(tmp_path: Path) -> None:
+    (finding,) = [i for i in _found("robots: {base-station: {nodes: []}}", tmp_path)[0] if i.code == "MC609"]
+    assert finding.expected == "the base's radio, base"

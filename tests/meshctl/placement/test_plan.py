@@ -266,6 +266,25 @@ def test_a_wrong_route_is_an_error(words: list[str], complaint: str) -> None:
     assert complaint in result.output
 
 
+def test_a_picture_does_not_overwrite_the_map(tmp_path: Path) -> None:
+    path = written(tmp_path)
+    image = path.parent / "mine.pgm"
+    before = {file: file.read_bytes() for file in (path, image)}
+    way = [",".join(map(str, occupancy_map.read_map(read(path), path).center(*at))) for at in ((1, 1), (8, 1))]
+    for option, file in (("--svg", path), ("--png", image)):
+        result = CliRunner().invoke(build("plan-placement"), ["plan-placement", str(path), *way, option, str(file)])
+        assert result.exit_code == 2
+        assert "is an input of this command, and would be overwritten" in result.output
+    assert {file: file.read_bytes() for file in before} == before
+
+
+def test_coordinates_may_begin_with_a_minus_sign() -> None:
+    words = ["plan-placement", str(GROUND), "-20,-5", "-1.5,0", "--json"]
+    result = CliRunner().invoke(build("plan-placement"), words)
+    assert result.exit_code == 0, result.output
+    assert json.loads(result.output)["length_m"] == 19.2
+
+
 def test_an_occupancy_map_is_drawn_below_its_plan(tmp_path: Path) -> None:
     path = written(tmp_path)
     found = occupancy_map.read_map(read(path), path)

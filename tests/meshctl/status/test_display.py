@@ -232,3 +232,19 @@ def test_an_invalid_filter_is_rejected_with_a_hint(
     with pytest.raises(InputError) as raised:
         filtered(fleet, words, alarms, **options)
     assert hint in raised.value.hint
+
+
+def test_selected_robots_that_were_not_queried_are_mentioned(fleet: Fleet) -> None:
+    """`status role:computer` of a lab said `all well` and `no device matches`."""
+    unasked = status_of(fleet, robots={}, robots_skipped="--no-robots")
+    kept = {
+        word: [one.code for one in select_devices(fleet, [word], Path.read_text).apply(unasked).alarms]  # type: ignore[arg-type]
+        for word in ("role:computer", "role:beacon")
+    }
+    assert kept == {"role:computer": ["robots-unasked"], "role:beacon": []}
+
+
+def test_the_alarms_that_exist_are_counted(fleet: Fleet) -> None:
+    with pytest.raises(InputError) as raised:
+        select_devices(fleet, (), Path.read_text, alarms=["nosuch"])  # type: ignore[arg-type]
+    assert re.search(r"expected one of unreachable, .* and \d+ more", raised.value.hint)

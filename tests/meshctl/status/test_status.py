@@ -165,6 +165,7 @@ def test_a_cut_vertex_is_reported_without_degrading_the_node(fleet: Fleet) -> No
         ({"overlay": Space("/overlay", 4 << 20, 1024)}, "flash"),
         ({"uci_changes": ("network.lan.ipaddr='1.2.3.4'",)}, "foreign"),
         ({"change": ChangeStatus("armed", owner="bob", left_s=40.0)}, "change"),
+        ({"change": ChangeStatus("idle", is_reloading_restored=True)}, "change"),
         ({"radios": (RadioState("radio0", False, False, False, True, {}, ()),)}, "radio"),
         ({"links": (WirelessLink("mesh0", "IBSS", MACS["rover"], joined=False),)}, "join"),
         ({"links": (WirelessLink("mesh0", "IBSS", MACS["rover"], channel=11, joined=True),)}, "channel"),

@@ -86,6 +86,13 @@ def test_a_report_never_replaces_the_results_that_it_shows(scenario: Path, capsy
     assert Path("mine-sweep.jsonl").read_bytes() == results
 
 
+def test_a_report_does_not_replace_the_scenario(scenario: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = scenario.read_bytes()
+    assert run_sweep([str(scenario), "--seeds", "1", "--report", str(scenario), *INLINE]) == 2
+    assert "expected another file than those of the scenario: give it another name" in capsys.readouterr().err
+    assert scenario.read_bytes() == before
+
+
 def test_one_seed_is_the_run_that_sim_makes(scenario: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run_sweep([str(scenario), "--seeds", "7-7", *INLINE]) == 0
     assert main([str(scenario), "--seed", "7", "--json"]) == 0
