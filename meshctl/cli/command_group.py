@@ -13,6 +13,7 @@ from typer import BadParameter
 from typer.core import TyperArgument, TyperCommand, TyperGroup
 
 _MIN_EXAMPLE_WIDTH = 20
+_POINT = "POINT"
 _COORDINATES = re.compile(r"-[0-9.]+,[-0-9.]+")
 _METAVARS = {Path: "PATH", int: "N", float: "NUMBER"}
 
@@ -39,8 +40,10 @@ class Command(TyperCommand):
                 formatter.write(_folded(f"Example: {' '.join(example.split())}", formatter) + "\n")
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        # click takes coordinates such as `-3,20` for options
-        words = [f" {word}" if _COORDINATES.fullmatch(word) else word for word in args]
+        words = args
+        if any(parameter.metavar == _POINT for parameter in self.params):
+            # click takes coordinates such as `-3,20` for options
+            words = [f" {word}" if _COORDINATES.fullmatch(word) else word for word in args]
         try:
             return super().parse_args(ctx, words)
         except BadParameter as error:
