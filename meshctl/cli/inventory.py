@@ -17,6 +17,7 @@ from meshctl.cli.export import export
 from meshctl.cli.inventory_import import app as import_app
 from meshctl.cli.output import echo, echo_json, terminal_width, write_file
 from meshctl.cli.public_key import own_public_key
+from meshctl.errors import InputError
 from meshctl.inventory.edit import Editor, save, set_state
 from meshctl.inventory.explain import ExplainedValue, explain
 from meshctl.inventory.json_schema import json_schema
@@ -62,6 +63,9 @@ def schema(
 
     Example: meshctl schema --out inventory.schema.json
     """
+    if out is not None and out.suffix in (".yaml", ".yml"):
+        # what it would overwrite is an inventory
+        raise InputError(f"--out: expected a file name that does not end in {out.suffix}, found {out}")
     text = json.dumps(json_schema(), indent=2) + "\n"
     if out is None:
         echo(text, nl=False)

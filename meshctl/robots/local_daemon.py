@@ -46,7 +46,8 @@ class LocalDaemon:
             return self._request(op, payload, fields)
         except (OSError, ValueError) as error:
             self.close()
-            raise DaemonError(f"{self.path}: {error}") from error
+            reason = error.strerror if isinstance(error, OSError) else None
+            raise DaemonError(f"{self.path}: {reason or error}") from error
 
     def event(self) -> tuple[dict[str, Any], bytes] | None:
         """The next event of a subscription: its header and payload; None if none comes for a while. Raises
@@ -62,7 +63,8 @@ class LocalDaemon:
             return self._frame(first + self._read(_LENGTHS.size - 1))
         except (OSError, ValueError) as error:
             self.close()
-            raise DaemonError(f"{self.path}: {error}") from error
+            reason = error.strerror if isinstance(error, OSError) else None
+            raise DaemonError(f"{self.path}: {reason or error}") from error
 
     def _frame(self, lengths: bytes) -> tuple[dict[str, Any], bytes]:
         header_bytes, payload_bytes = _LENGTHS.unpack(lengths)

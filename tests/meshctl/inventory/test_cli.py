@@ -66,6 +66,10 @@ def test_schema_prints_or_writes_json(tmp_path: Path) -> None:
     assert _meshctl("schema", "--out", tmp_path / "s.json").exit_code == 0
     assert (tmp_path / "s.json").read_text() == printed.stdout
     assert _meshctl("schema", "--out", tmp_path / "no" / "s.json").exit_code == 2
+    fleet = tmp_path / "fleet.yaml"
+    fleet.write_text("name: alpha\n")
+    assert _meshctl("schema", "--out", fleet).exit_code == 2
+    assert fleet.read_text() == "name: alpha\n"
 
 
 def test_list_shows_every_node_as_text_and_json() -> None:
