@@ -22,13 +22,14 @@ class ChangeListener(Protocol):
     def restarting(self, names: Iterable[str]) -> None:
         """The radios of these nodes restart at the same moment: they keep no station entry from before."""
 
-    def armed(self, connection: SshConnection | None, *, for_s: float) -> None:
+    def armed(self, connection: SshConnection | None, *, for_s: float, is_alone: bool = True) -> None:
         """The change starts next and ends within `for_s`; the node still forwards its neighbors' frames.
 
-        `connection` is None for a node that loses its processes in the change. Raises Unreachable.
+        `connection` is None for a node that loses its processes in the change. `is_alone`: no other node's radio
+        restarts in the same change. Raises Unreachable.
         """
 
-    def watch_own_entries(self, connection: SshConnection, *, for_s: float) -> None:
+    def watch_own_entries(self, connection: SshConnection, *, for_s: float, is_alone: bool = False) -> None:
         """The node's neighbors change at the same moment, and all changes end within `for_s`. Raises Unreachable."""
 
     def started(self) -> None:

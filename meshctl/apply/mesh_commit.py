@@ -164,7 +164,7 @@ def _watch_unchanged(commit: _MeshCommit, change: ChangeInProgress, connection: 
     change.listener.restarting(
         [other.name for other in commit.participants if other.change is not None and other.change.radios]
     )
-    change.listener.armed(connection, for_s=commit.longest_s)
+    change.listener.armed(connection, for_s=commit.longest_s, is_alone=False)
 
 
 def _schedule(commit: _MeshCommit) -> None:

@@ -236,12 +236,14 @@ def reconnect_script(
     return "".join((script("stale_station.sh"), *flushes, f"pause {RELEARN_S}\n", *sends))
 
 
-def watch_script(node: str, entries: Iterable[StationEntry], *, for_s: float) -> str:
+def watch_script(node: str, entries: Iterable[StationEntry], *, for_s: float, ends_when_confirmed: bool = False) -> str:
     """POSIX sh that starts a background process on the holder, which for `for_s` removes those of its entries that
-    become stale. It replaces a process that already watches for `node`."""
+    become stale. It replaces a process that already watches for `node`. `ends_when_confirmed`: the holder is `node`,
+    and its own change is the only one."""
     watched = [f"{entry.ifname}/{entry.mac}" for entry in entries]
     pid_file = quoted(f"/tmp/meshctl/forget.{node}.pid")
-    loop = f"{script('stale_station.sh')}watch_stale {math.ceil(for_s)} {quoted(*watched)}\nrm -f {pid_file}"
+    own = "IS_OWN=yes " if ends_when_confirmed else ""
+    loop = f"{script('stale_station.sh')}{own}watch_stale {math.ceil(for_s)} {quoted(*watched)}\nrm -f {pid_file}"
     # the process id of a killed watch stays, and may be another process's by now
     return (
         f"mkdir -p /tmp/meshctl; pid=$(cat {pid_file} 2>/dev/null); rm -f {pid_file}\n"

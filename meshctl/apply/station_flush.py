@@ -122,12 +122,12 @@ class StationFlush:
         """The radios of these nodes restart at the same moment: they keep no station entry from before."""
         self._restarting = frozenset(names) - {self.node}
 
-    def armed(self, connection: SshConnection | None, *, for_s: float) -> None:
+    def armed(self, connection: SshConnection | None, *, for_s: float, is_alone: bool = True) -> None:
         """Start watches on the node itself and on the nodes reached through it. Raises Unreachable."""
         if not self.radios:
             return
         if connection is not None:
-            self.watch_own_entries(connection, for_s=for_s)
+            self.watch_own_entries(connection, for_s=for_s, is_alone=is_alone)
         self._watch_neighbors(for_s=for_s)
 
     def _watch_neighbors(self, *, for_s: float) -> None:
@@ -146,13 +146,13 @@ class StationFlush:
                 f"{all_of(unwatched)} did not answer and cannot watch their entries of its radio", self.node
             )
 
-    def watch_own_entries(self, connection: SshConnection, *, for_s: float) -> None:
+    def watch_own_entries(self, connection: SshConnection, *, for_s: float, is_alone: bool = False) -> None:
         """Start a watch on the node itself. If a neighbor removes its entry although the radio did not restart, the
         node removes its own, and both count from 0. Otherwise a node whose part of a simultaneous change is called off
         would keep its entries of those that restart."""
-        entries = own_entries(self.node, self.ctx.before, self.radios)
-        if entries:
-            self._watches_itself = connection.run(watch_script(self.node, entries, for_s=for_s)).exit_status == 0
+        if entries := own_entries(self.node, self.ctx.before, self.radios):
+            watch = watch_script(self.node, entries, for_s=for_s, ends_when_confirmed=is_alone)
+            self._watches_itself = connection.run(watch).exit_status == 0
 
     def started(self) -> None:
         """The change starts: from now on its radio may restart."""

@@ -17,6 +17,7 @@ ECHOES=3       # each is sent up to seven times on the air: a link that loses al
 LOGIN_S=3      # for a connection to dropbear: TCP tries at 0 and 1 s, and again at 3 s
 WATCH_PAUSE_S=2
 FLUSHES=3      # per watch and entry: if removing it did not help, repeating it does not either
+CONFIRMED_S=20 # a watch of the node that changes ends so long after the confirmation: neighbors are queried right after it
 SENDERS=40     # of `catch_up`: each sends one echo request per second, until it is answered; 2,080 in all, of 4,096 numbers
 SENT_EACH=52
 
@@ -163,13 +164,24 @@ pause() {
 	fi
 }
 
-# watch_stale SECONDS DEV/MAC...: for SECONDS, removes entries that are older than the watch and become stale
+# last_change: LAST, the line about the change of this node that ended last (deadman.sh)
+last_change() { LAST='' && read -r LAST 2>/dev/null </etc/meshctl/last; }
+
+# watch_stale SECONDS DEV/MAC...: for SECONDS, removes entries that are older than the watch and become stale. With
+# IS_OWN=yes, of a node of which no neighbor changes, it ends soon after the change of this node is confirmed.
 watch_stale() {
 	read -r up _ </proc/uptime
 	began=${up%.*} until=$((${up%.*} + $1))
 	shift
 	left=$((FLUSHES * $#))
+	last_change
+	before=$LAST
 	while pause $WATCH_PAUSE_S && read -r up _ </proc/uptime && [ "${up%.*}" -lt $until ] && [ $left -gt 0 ]; do
+		[ -z "$IS_OWN" ] || last_change
+		case $LAST in
+		"$before") ;;
+		*' confirmed '*) before=$LAST && [ $until -le $((${up%.*} + CONFIRMED_S)) ] || until=$((${up%.*} + CONFIRMED_S)) ;;
+		esac
 		for entry; do
 			watched=${entry%%/*} age=$((${up%.*} - began))
 			look "$watched" "${entry#*/}"

@@ -204,6 +204,7 @@ sed -n "$(cat "$HERE/now")s/.*|//p" "$HERE"/seconds
 """,
     "sleep": """[ ! -f "$HERE/login" ] || until [ -f "$HERE/called" ]; do /bin/sleep 0.01; done
 now=$(($(cat "$HERE/now") + $1)); echo $now >"$HERE/now"; echo $((1000 + now)).00 1.00 >"$HERE/uptime"
+[ ! -f "$HERE/last.$now" ] || cp "$HERE/last.$now" "$HERE/memory/last"
 """,
     # `login` is what the neighbor's dropbear says; then it waits, as dropbear does. A pause lasts until it has spoken
     "nc": """cat "$HERE/login" >&2; echo "$@" >"$HERE/called"; exec /bin/sleep 60""",
@@ -230,6 +231,7 @@ def deletions(place: Path, seconds: list[Second], text: str, *, bat: str = "bat0
         (place / "net" / "mesh0" / "master").symlink_to(f"../{bat}")
     text = text.replace("/sys/class/net", str(place / "net")).replace("/proc/uptime", str(place / "uptime"))
     text = text.replace("/tmp/meshctl", str(place / "memory")).replace("/proc/net/arp", str(place / "arp"))
+    text = text.replace("/etc/meshctl/last", str(place / "memory" / "last"))
     environ = {"PATH": f"{place}:/usr/bin:/bin", "HERE": str(place)}
     done = subprocess.run(
         ("sh", "-c", text), env=environ, cwd=place, capture_output=True, text=True, check=False, timeout=120
@@ -395,9 +397,10 @@ def test_nothing_is_sent_to_a_neighbor_that_answers_or_is_not_heard(
     assert not (tmp_path / "asked").exists() or " -c 52 " not in (tmp_path / "asked").read_text()
 
 
-def watched(place: Path, seconds: list[Second]) -> list[int]:
+def watched(place: Path, seconds: list[Second], *, ends_when_confirmed: bool = False) -> list[int]:
     """When an entry like this is deleted by a holder that watches it."""
-    text = watch_script("b02", [StationEntry("b01", "mesh0", MAC)], for_s=len(seconds))
+    entries = [StationEntry("b01", "mesh0", MAC)]
+    text = watch_script("b02", entries, for_s=len(seconds), ends_when_confirmed=ends_when_confirmed)
     _, deleted = deletions(place, [*seconds, *seconds[-1:]], text)
     assert all(line.endswith(f" mesh0 {MAC}") for line in deleted)
     return [int(line.split()[0]) for line in deleted]
@@ -422,6 +425,23 @@ def test_a_radio_that_comes_back_as_a_new_station_is_left_alone(tmp_path: Path) 
 
 def test_an_ineffective_removal_is_attempted_at_most_three_times(tmp_path: Path) -> None:
     assert len(watched(tmp_path, [Second(100, 500 + at, LOST) for at in range(60)])) == 3
+
+
+@pytest.mark.parametrize(
+    ("outcome", "ends_when_confirmed", "is_short"),
+    [("confirmed", True, True), ("restored", True, False), ("confirmed", False, False)],
+)
+def test_a_nodes_own_watch_ends_soon_after_its_change_is_confirmed(
+    tmp_path: Path, outcome: str, ends_when_confirmed: bool, is_short: bool
+) -> None:
+    """On 25.12 userspace, it started two processes every two seconds for two minutes after the confirmation."""
+    last = tmp_path / "memory" / "last"
+    last.parent.mkdir()
+    last.write_text("c1 confirmed operator 00\n")
+    (tmp_path / "last.11").write_text(f"c2 {outcome} operator 00\n")
+    watched(tmp_path, [Second(100, 500 + at, ANSWERED) for at in range(100)], ends_when_confirmed=ends_when_confirmed)
+    looks_end_s = int((tmp_path / "now").read_text())
+    assert (looks_end_s < 45) is is_short
 
 
 def test_a_watch_leaves_no_file_behind_and_replaces_only_a_watch(tmp_path: Path) -> None:

@@ -239,7 +239,9 @@ def test_an_armed_change_starts_watches_on_the_node_and_on_those_reached_through
     assert (own, near.names) == ([], ["b03"])
     flush = near.flushes.listener(near.job, EVERY_RADIO)
     flush.armed(connection, for_s=100.0)
-    assert ["watch_stale 100" in script for script in own] == [True]
+    assert ["IS_OWN=yes watch_stale 100" in script for script in own] == [True]
+    # on a node that does not change, and has no confirmation of its own
+    assert "IS_OWN=yes watch_stale" not in near.asked[-1][1]
     flush.started()
     flush.unreachable()
     # b03 cannot be reached, and watches by itself
@@ -253,8 +255,10 @@ def test_a_node_watches_its_entries_of_nodes_that_restart_at_the_same_moment() -
     own: list[str] = []
     flush = near.flushes.listener(near.job, EVERY_RADIO)
     flush.restarting(["b01", "b02"])
-    flush.armed(watching(own), for_s=100.0)
+    flush.armed(watching(own), for_s=100.0, is_alone=False)
     assert ["watch_stale 100" in script and MACS["b01"] in script for script in own] == [True]
+    # the others may go back after this one is confirmed
+    assert "IS_OWN=yes watch_stale" not in own[0]
 
 
 def test_a_node_that_went_back_has_the_nodes_queried_that_restarted_with_it() -> None:
