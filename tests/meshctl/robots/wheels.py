@@ -5,14 +5,17 @@ from __future__ import annotations
 import importlib.metadata
 import re
 import shutil
+import sys
 import zipfile
 from pathlib import Path
 
 import udp_mesh
 from meshctl.robots.wheels import REQUIREMENTS, Wheel, build_wheel
 
+ZSTD = ("backports.zstd",) if sys.version_info < (3, 14) else ()
 
-def repack(directory: Path, projects: tuple[str, ...] = (*REQUIREMENTS, "backports.zstd")) -> Path:
+
+def repack(directory: Path, projects: tuple[str, ...] = (*REQUIREMENTS, *ZSTD)) -> Path:
     """Write one wheel for each project into `directory`, with the tags it was installed with."""
     directory.mkdir(parents=True, exist_ok=True)
     for project in projects:

@@ -5,13 +5,18 @@ from __future__ import annotations
 import hashlib
 import hmac
 import struct
+import sys
 import time
 import zlib
 from typing import Any
 
-from backports import zstd
 from cryptography.exceptions import InvalidTag
 from cryptography.hazmat.primitives.ciphers.aead import AESGCM
+
+if sys.version_info >= (3, 14):
+    from compression import zstd
+else:
+    from backports import zstd
 
 HELLO, BROADCAST, INTRODUCTION, DATA = range(4)
 TO_ALL = bytes(16)

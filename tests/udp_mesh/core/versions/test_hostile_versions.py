@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from backports import zstd
+import sys
+
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -11,6 +12,11 @@ from udp_mesh.core.versions.encoding import Version, encode
 from udp_mesh.core.zstd import DECOMPRESS_STEP_BYTES, ZstdDecompression
 from udp_mesh.wire.frames import MessageFlag, RefuseReason
 from udp_mesh.wire.version import NO_BASE, VersionHeader, encode_version, version_hash
+
+if sys.version_info >= (3, 14):
+    from compression import zstd
+else:
+    from backports import zstd
 
 PACKED = MessageFlag.VERSION | MessageFlag.COMPRESSED | MessageFlag.ZSTD
 
