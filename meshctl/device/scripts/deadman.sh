@@ -8,7 +8,7 @@
 # after a power cut the marker alone says what to do. Content is synced before the rename that makes it count.
 # Restoring moves the kept files back one by one: done twice, or half and then again, it ends the same, and it needs no
 # free flash.
-VERSION=13
+VERSION=14
 SELF=/usr/sbin/meshctl-deadman
 CHANGE=/etc/meshctl/change # flash: marker, manifest, reload, new/ (to come), prev/ and previous (to go back to), extra, last.*
 LAST=/etc/meshctl/last     # flash: "ID OUTCOME REASON NONCE_SHA256" of the last change that ended
