@@ -214,7 +214,8 @@ def _uncertain(change: ChangeInProgress) -> Outcome:
     elif change.ctx.run.interrupt.leaving:
         why = f"interrupted during its change; it rolls back by itself within {change.window_s} s"
     else:
-        why = f"unreachable since its change started ({change.last_error}); its timer has rolled it back"
+        error = change.last_error
+        why = f"unreachable since its change started ({error}); if it is running, its timer has rolled it back"
     return Outcome(
         change.ctx.name, Result.UNCERTAIN, why, hint="when it answers again, `meshctl status` shows its state"
     )

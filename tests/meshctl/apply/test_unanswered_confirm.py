@@ -67,7 +67,7 @@ def test_a_node_that_did_not_answer_its_confirmation_is_not_said_to_have_rolled_
 ) -> None:
     change = a_change(monkeypatch, [])
     change.last_error = "b01: no answer"
-    assert "its timer has rolled it back" in _uncertain(change).reason
+    assert "; if it is running, its timer has rolled it back" in _uncertain(change).reason
     change.is_confirm_unanswered = True
     why = "it did not answer its confirmation (b01: no answer): "
     why += "it keeps the change if that arrived; otherwise its timer rolls it back"
