@@ -14,6 +14,14 @@ from meshctl.fleet.journal import Journal
 from tests.meshctl.inventory.inventories import HEAD
 
 
+def _inventory_with_journal(directory: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An inventory whose fleet is called trial; the journal is in this directory, too."""
+    monkeypatch.setenv("XDG_STATE_HOME", str(directory))
+    inventory = directory / "fleet.yaml"
+    inventory.write_text(HEAD, encoding="utf-8")
+    return inventory
+
+
 @pytest.mark.parametrize(
     ("of", "asked_by", "error", "hint"),
     [
@@ -66,9 +74,7 @@ def test_the_last_run_is_the_latest_of_the_fleet_and_the_lab(tmp_path: Path) -> 
 def test_an_interrupted_rollback_is_repeated_not_undone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
-    inventory = tmp_path / "fleet.yaml"
-    inventory.write_text(HEAD, encoding="utf-8")
+    inventory = _inventory_with_journal(tmp_path, monkeypatch)
     with Journal(tmp_path / "meshctl/journal.sqlite") as journal:
         for command in ("provision", "rollback", "rollback"):
             run = journal.begin(command, fleet="trial", inventory="inv", nodes=("a",))
@@ -91,9 +97,7 @@ def test_a_run_in_progress_is_not_resumed(tmp_path: Path) -> None:
 def test_a_finished_run_of_any_kind_has_nothing_to_resume(
     command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
-    inventory = tmp_path / "fleet.yaml"
-    inventory.write_text(HEAD, encoding="utf-8")
+    inventory = _inventory_with_journal(tmp_path, monkeypatch)
     with Journal(tmp_path / "meshctl/journal.sqlite") as journal:
         run = journal.begin(command, fleet="trial", inventory="inv", nodes=("a",))
         run.finish_node(Outcome("a", Result.DONE))
@@ -106,9 +110,7 @@ def test_a_finished_run_of_any_kind_has_nothing_to_resume(
 def test_the_last_run_to_resume_is_the_latest_unfinished_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
-    inventory = tmp_path / "fleet.yaml"
-    inventory.write_text(HEAD, encoding="utf-8")
+    inventory = _inventory_with_journal(tmp_path, monkeypatch)
     with Journal(tmp_path / "meshctl/journal.sqlite") as journal:
         for node, result in (("a", Result.PENDING), ("b", Result.DONE)):
             run = journal.begin("provision", fleet="trial", inventory="inv", nodes=(node,))
