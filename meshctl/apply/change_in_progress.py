@@ -16,6 +16,7 @@ from dataclasses import dataclass, field, replace
 from meshctl.apply.change_listener import ChangeListener
 from meshctl.apply.change_set import change_of, new_change_id, new_nonce, radios_of, services_of
 from meshctl.apply.context import NodeContext
+from meshctl.apply.first_boot import await_first_boot
 from meshctl.apply.health_checks import RELOADING, unmet
 from meshctl.apply.next_action import Action, applied_age_s, next_action
 from meshctl.deadline import deadline
@@ -25,12 +26,10 @@ from meshctl.device.deadman import Change, Payload
 from meshctl.device.errors import AuthenticationRefused, CommandFailed, NodeRefused
 from meshctl.device.observation import ChangeStatus, Observation
 from meshctl.device.observe import observe
-from meshctl.device.openwrt import is_first_boot
 from meshctl.device.ssh import SshConnection
 from meshctl.device.upload import UploadProgress
 from meshctl.errors import NodeError
 from meshctl.model import Secret
-from meshctl.nodes.backoff import Backoff
 from meshctl.nodes.slots import Slot
 from meshctl.plan import Cut
 from meshctl.plan.effects import loaded_package
@@ -47,10 +46,10 @@ PACKAGES_SETTLE_S = 3.0  # the reload of a package change sends its events and d
 APPLY_DELAY_S, APPLY_ANSWER_TIMEOUT_S = 0.5, 15.0
 # How long a node that keeps its address is waited for over the connection that sent the change.
 AWAIT_RELOAD_S = 30
+# How long a look waits on the node for that: a login takes a slow node about as long.
+LOOK_AWAITS_S = 5
 # A rollback restores the files and reloads the services, which takes a board some 10 s.
 ROLLBACK_S = 30.0
-# Erasing 16 MB of NOR takes up to three minutes, more with other work beside it; then its init scripts run.
-FIRST_BOOT_TIMEOUT_S = 600.0
 # The UCI packages with which a node may drop a login without an answer; with others it refuses it.
 _MAY_DROP_LOGINS = frozenset({"firewall", "network"})
 # A login at an address other than the new one may hang: another device may have that address, or the server may be
@@ -176,25 +175,6 @@ def arm(change: ChangeInProgress, connection: SshConnection) -> None:
         change.armed_in_s = time.monotonic() - began_s
 
 
-def await_first_boot(ctx: NodeContext, connection: SshConnection) -> None:
-    """Wait for the end of the first boot after a flash: a power cut in it undoes confirmed files. Raises NodeError."""
-    if not ctx.before.is_first_boot or not is_first_boot(connection):
-        return
-    ctx.run.note("waiting until its first boot has ended (its flash is formatted, its services start)", ctx.name)
-    backoff = Backoff(FIRST_BOOT_TIMEOUT_S, ctx.run.interrupt)
-    with ctx.step("first boot"):
-        while is_first_boot(connection):
-            if ctx.run.interrupt.leaving:
-                raise NodeError(f"{ctx.name}: interrupted before its first boot had ended; nothing was changed")
-            if backoff.is_over:
-                raise NodeError(
-                    f"{ctx.name}: its first boot has not ended within {FIRST_BOOT_TIMEOUT_S / 60:.0f} minutes; "
-                    "nothing was changed",
-                    hint="power-cycle it, then run again; if that does not help, an init script of its image hangs",
-                )
-            backoff.pause()
-
-
 def install_switch(ctx: NodeContext, connection: SshConnection) -> None:
     """Install the dead-man's switch unless the node has this version."""
     known = ctx.before.change
@@ -290,13 +270,18 @@ def _deadlines(change: ChangeInProgress, endpoint: Endpoint) -> Deadlines:
 
 
 def observe_and_decide(
-    change: ChangeInProgress, connection: SshConnection, *, is_opened_after_reload: bool = False
+    change: ChangeInProgress,
+    connection: SshConnection,
+    *,
+    is_opened_after_reload: bool = False,
+    slot: Slot | None = None,
 ) -> Action:
     """Observe the node once and return the next action. `is_opened_after_reload`: the services are known to have
-    reloaded before the connection was opened. Raises Unreachable."""
+    reloaded before the connection was opened. The slot is given back while the node is waited for. Raises
+    Unreachable."""
     ctx = change.ctx
     if not is_opened_after_reload:
-        busy = _while_it_reloads(change, connection)
+        busy = _while_it_reloads(change, connection, slot)
         if busy is not None:
             return busy
     change.last = observe(connection, brief=True)
@@ -321,14 +306,19 @@ def observe_and_decide(
     )
 
 
-def _while_it_reloads(change: ChangeInProgress, connection: SshConnection) -> Action | None:
-    """The next action while the node's services reload; None when it is time for a full observation.
+def _while_it_reloads(change: ChangeInProgress, connection: SshConnection, slot: Slot | None) -> Action | None:
+    """The next action while the node's services reload, or when they just have; None when it is time for a full
+    observation.
 
-    A full observation would slow the reload on a small processor, and break when the radio goes down. Raises
-    Unreachable.
+    A full observation would slow the reload on a small processor, as further logins would, and break when the radio
+    goes down. Raises Unreachable.
     """
+    is_over = change.is_reloaded or change.is_abandoned or change.ctx.run.interrupt.leaving
+    await_s = 0 if is_over else min(LOOK_AWAITS_S, change.window_s // 8)
+    if slot is not None and await_s:
+        slot.release()
     try:
-        status = deadman.status(connection)
+        status = deadman.status(connection, started=change.id, await_reload_s=await_s)
     except CommandFailed:
         # the observation reports the fault
         return None

@@ -30,6 +30,7 @@ from meshctl.device.ssh import SshConnection
 from meshctl.errors import NodeError, Unreachable
 from meshctl.fleet import Outcome, Result
 from meshctl.nodes.backoff import Backoff
+from meshctl.nodes.slots import Slot
 
 # After the window the node restores its files, reloads and rejoins its mesh, or reboots where that fails.
 GRACE_AFTER_WINDOW_S = 60.0
@@ -88,8 +89,8 @@ def poll(change: ChangeInProgress) -> Outcome:
     proof: SshConnection | None = None
     try:
         while not backoff.is_over:
-            with run_context.connections.slots.use(change.ctx.name):
-                outcome, proof = _observe_once(change, proof)
+            with run_context.connections.slots.use(change.ctx.name) as slot:
+                outcome, proof = _observe_once(change, proof, slot)
             if outcome is not None:
                 _notify_end(change, outcome)
                 return outcome
@@ -102,7 +103,9 @@ def poll(change: ChangeInProgress) -> Outcome:
     return _uncertain(change)
 
 
-def _observe_once(change: ChangeInProgress, proof: SshConnection | None) -> tuple[Outcome | None, SshConnection | None]:
+def _observe_once(
+    change: ChangeInProgress, proof: SshConnection | None, slot: Slot
+) -> tuple[Outcome | None, SshConnection | None]:
     """The outcome once the change has ended, and the connection to use the next time, if one may be kept."""
     was_reloaded = change.is_reloaded
     if proof is not None and proof.is_open:
@@ -114,7 +117,7 @@ def _observe_once(change: ChangeInProgress, proof: SshConnection | None) -> tupl
         change.listener.unreachable(is_login_due=change.is_login_due)
         return None, None
     try:
-        outcome = _act(change, connection, is_proof=was_reloaded)
+        outcome = _act(change, connection, slot, is_proof=was_reloaded)
     except Unreachable as error:
         change.last_error, outcome = str(error), None
     except BaseException:
@@ -122,7 +125,8 @@ def _observe_once(change: ChangeInProgress, proof: SshConnection | None) -> tupl
         raise
     if change.last is not None:
         change.ctx.run.record(change.ctx.name, change.last)
-    if was_reloaded and outcome is None and connection.is_open:
+    # at its former address it proves nothing, and the new one has to be tried
+    if was_reloaded and outcome is None and connection.is_open and connection.endpoint == change.new:
         return None, connection
     if outcome is not None and outcome.result is Result.DONE:
         change.ctx.run.connections.release(change.ctx.name, connection)
@@ -131,11 +135,11 @@ def _observe_once(change: ChangeInProgress, proof: SshConnection | None) -> tupl
     return outcome, None
 
 
-def _act(change: ChangeInProgress, connection: SshConnection, *, is_proof: bool) -> Outcome | None:
+def _act(change: ChangeInProgress, connection: SshConnection, slot: Slot, *, is_proof: bool) -> Outcome | None:
     """Observe the node once and take the next action; the outcome once the change has ended. `is_proof`: the connection
     was opened after the services had reloaded."""
     name = change.ctx.name
-    match observe_and_decide(change, connection, is_opened_after_reload=is_proof):
+    match observe_and_decide(change, connection, is_opened_after_reload=is_proof, slot=slot):
         case Action.CONFIRM:
             # a second login, after the proof, where an effect that nothing showed could refuse it
             proof = connection if is_proof and not change.decides_logins else None

@@ -22,7 +22,6 @@ from meshctl.apply.change_in_progress import (
     ChangeInProgress,
     abort,
     arm,
-    await_first_boot,
     confirm,
     connect,
     new_change,
@@ -30,8 +29,9 @@ from meshctl.apply.change_in_progress import (
     start,
     unlock,
 )
-from meshctl.apply.commit_confirm import GRACE_AFTER_WINDOW_S, poll, unanswered_text
+from meshctl.apply.commit_confirm import GRACE_AFTER_WINDOW_S, poll
 from meshctl.apply.context import NodeContext, RunContext
+from meshctl.apply.first_boot import await_first_boot
 from meshctl.apply.participant import (
     Participant,
     canceled_because,
@@ -41,6 +41,7 @@ from meshctl.apply.participant import (
     quorum_of,
     rolled_back_outcome,
     short_of_quorum,
+    unconfirmed_outcome,
     unmet_of,
 )
 from meshctl.device.errors import NodeRefused
@@ -55,8 +56,6 @@ from meshctl.wording import counted
 ARM_S = 60.0
 # The share of the confirm window reserved for confirming.
 CONFIRM_SHARE = 0.25
-# The fact in the outcome of a node left in the old cell: what differs between its cell and the mesh's.
-LEFT_BEHIND = "left_behind"
 
 
 @dataclass(slots=True)
@@ -125,7 +124,12 @@ def commit_mesh(
         must = "pass their checks" if together else "rejoin"
         verb = "changes" if len(participants) == 1 else "change"
         run_context.note(f"{counted(len(participants), 'node')} {verb} simultaneously; {quorum_text} must {must}")
-        return _decide(commit, needed)
+        try:
+            return _decide(commit, needed)
+        finally:
+            for participant in participants:
+                if (unused := participant.take_proof()) is not None:
+                    unused.close()
 
 
 def _await_first_boot(commit: _MeshCommit, participant: Participant) -> None:
@@ -280,20 +284,28 @@ def _notify_unreachable(commit: _MeshCommit, proven: Sequence[Participant]) -> N
 
 
 def _prove(participant: Participant) -> None:
+    """Observe a participant once. A connection that was opened after its services had reloaded is kept: another one
+    would prove nothing more."""
     change = participant.change
-    connection = None if change is None else connect(change)
+    if change is None:
+        return
+    was_reloaded = change.is_reloaded
+    connection = participant.take_proof() or connect(change)
     participant.is_unreachable = connection is None
-    if change is None or connection is None:
+    if connection is None:
         return
     try:
-        action = observe_and_decide(change, connection)
+        action = observe_and_decide(change, connection, is_opened_after_reload=was_reloaded)
         participant.decide(action)
         if change.last is not None:
             participant.ctx.run.record(participant.name, change.last)
+        if was_reloaded and not participant.is_decided and connection.endpoint == change.new:
+            participant.proof = connection
     except NodeError as error:
         change.last_error = str(error)
     finally:
-        connection.close()
+        if participant.proof is None:
+            connection.close()
 
 
 def _confirm_all(commit: _MeshCommit) -> dict[str, Outcome]:
@@ -340,17 +352,7 @@ def _confirmed_outcome(participant: Participant) -> Outcome:
         # it is where it was, so its way back can be observed
         change.is_abandoned = True
         return poll(change)
-    if change is not None and change.is_confirm_unanswered:
-        why = unanswered_text(change, "it is in the new cell if that arrived; otherwise it rolls back to the old one")
-        return Outcome(participant.name, Result.UNCERTAIN, why, hint="run `meshctl resume`, by cable if it is away")
-    unmet = "; ".join(change.unmet) if change is not None and change.unmet else "it was not observed"
-    return Outcome(
-        participant.name,
-        Result.UNCERTAIN,
-        f"left behind: the others are in the new cell, it rolls back to the old one ({unmet})",
-        hint="connect it by cable and run `meshctl resume`, or change the mesh back to the old cell",
-        facts={LEFT_BEHIND: ", ".join(participant.ctx.plan.splits)},
-    )
+    return unconfirmed_outcome(participant)
 
 
 def _roll_back(commit: _MeshCommit, reason: str) -> dict[str, Outcome]:

@@ -12,10 +12,11 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from meshctl.apply.change_in_progress import ChangeInProgress, await_first_boot
+from meshctl.apply.change_in_progress import ChangeInProgress
 from meshctl.apply.change_set import new_change_id, new_nonce
 from meshctl.apply.commit_confirm import run_change
 from meshctl.apply.context import NodeContext
+from meshctl.apply.first_boot import await_first_boot
 from meshctl.apply.health_checks import Expectation
 from meshctl.device import deadman
 from meshctl.device.deadman import Change

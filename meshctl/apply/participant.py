@@ -8,9 +8,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from meshctl.apply.change_in_progress import ChangeInProgress
+from meshctl.apply.commit_confirm import unanswered_text
 from meshctl.apply.context import NodeContext
 from meshctl.apply.next_action import Action, reason_text
 from meshctl.device.openwrt import UptimeSample
+from meshctl.device.ssh import SshConnection
 from meshctl.fleet import Outcome, Result
 
 # The scheduled moment is this many round trips of the slowest node ahead, or this many times the time that the slowest
@@ -19,6 +21,8 @@ from meshctl.fleet import Outcome, Result
 LEAD_ROUND_TRIPS = 6
 LEAD_ARMS = 3
 LEAD_S = 2.0
+# The fact in the outcome of a node left in the old cell: what differs between its cell and the mesh's.
+LEFT_BEHIND = "left_behind"
 # Each of the others has its own reason in its own outcome.
 MAX_NAMED = 3
 
@@ -39,6 +43,8 @@ class Participant:
     # it has rolled back, or its reload has failed
     has_failed: bool = False
     is_confirmed: bool = False
+    # a connection that was opened after its services had reloaded, kept until the node has proven itself
+    proof: SshConnection | None = None
 
     @property
     def name(self) -> str:
@@ -56,6 +62,11 @@ class Participant:
     @property
     def leaves_cell(self) -> bool:
         return bool(self.ctx.plan.splits)
+
+    def take_proof(self) -> SshConnection | None:
+        """The kept connection, if it is still open."""
+        proof, self.proof = self.proof, None
+        return proof if proof is not None and proof.is_open else None
 
     def awaits_confirm(self, *, is_window_over: bool) -> bool:
         """Whether it may still be confirmed: after the window only if the answer to its confirmation may be lost."""
@@ -140,3 +151,19 @@ def rolled_back_outcome(outcome: Outcome | None, name: str, reason: str, gap: st
     if outcome.result is Result.ROLLED_BACK:
         return Outcome(name, Result.ROLLED_BACK, "; ".join(filter(None, (reason, gap))))
     return outcome
+
+
+def unconfirmed_outcome(participant: Participant) -> Outcome:
+    """The outcome of a participant that was not confirmed with the others and left its cell with them."""
+    change = participant.change
+    if change is not None and change.is_confirm_unanswered:
+        why = unanswered_text(change, "it is in the new cell if that arrived; otherwise it rolls back to the old one")
+        return Outcome(participant.name, Result.UNCERTAIN, why, hint="run `meshctl resume`, by cable if it is away")
+    unmet = "; ".join(change.unmet) if change is not None and change.unmet else "it was not observed"
+    return Outcome(
+        participant.name,
+        Result.UNCERTAIN,
+        f"left behind: the others are in the new cell, it rolls back to the old one ({unmet})",
+        hint="connect it by cable and run `meshctl resume`, or change the mesh back to the old cell",
+        facts={LEFT_BEHIND: ", ".join(participant.ctx.plan.splits)},
+    )

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from meshctl.apply.mesh_commit import LEFT_BEHIND
 from meshctl.apply.next_action import reason_text
+from meshctl.apply.participant import LEFT_BEHIND
 from meshctl.apply.prepare import Prepared
 from meshctl.device.observation import ChangeStatus
 from meshctl.fleet import Outcome, Result

@@ -158,9 +158,16 @@ def version() -> str:
     return found[1] if found else ""
 
 
-def status(connection: Connection) -> ChangeStatus:
-    """The switch's state; `installed=False` if the node has none."""
-    done = connection.run(f"[ -x {PROGRAM} ] || {{ echo absent; exit 0; }}; {PROGRAM} status")
+def status(connection: Connection, *, started: str = "", await_reload_s: int = 0) -> ChangeStatus:
+    """The switch's state; `installed=False` if the node has none.
+
+    While the change `started` is in progress, the node answers when its reload has ended, or after `await_reload_s`.
+    """
+    wait = ""
+    if started and await_reload_s:
+        is_reloading = f"[ -e {BUNDLE_DIRECTORY}/change-{started}/due ] && [ ! -e {BUNDLE_DIRECTORY}/reloaded ]"
+        wait = f"i={await_reload_s}; while [ $i -gt 0 ] && {is_reloading}; do sleep 1; i=$((i - 1)); done; "
+    done = connection.run(f"[ -x {PROGRAM} ] || {{ echo absent; exit 0; }}; {wait}{PROGRAM} status")
     if done.stdout.strip() == "absent":
         return ChangeStatus(state="absent", installed=False)
     found = parse_status(done.stdout)

@@ -20,6 +20,7 @@ from meshctl.apply.change_in_progress import (
     observe_and_decide,
     start,
 )
+from meshctl.apply.change_listener import ChangeListener
 from meshctl.apply.commit_confirm import _observe_once, _uncertain
 from meshctl.apply.context import NodeContext
 from meshctl.apply.health_checks import Expectation
@@ -85,6 +86,48 @@ def test_an_applied_change_is_checked_even_if_its_age_is_unknown(monkeypatch: py
     unknown = ChangeStatus("applied", "c1", reload_status=0)
     assert looked_at(change, monkeypatch, unknown, "192.168.1.1/24") is Action.WAIT
     assert change.unmet == ("its LAN has 192.168.1.1/24, not 10.42.0.101",)
+
+
+def test_a_look_waits_for_the_end_of_the_reload_without_a_slot(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each login at a slow node slows its reload."""
+    slots, waits, held = ChannelSlots(), [], []
+
+    def status(_: SshConnection, *, started: str, await_reload_s: int) -> ChangeStatus:
+        assert started == "c1"
+        waits.append(await_reload_s)
+        held.append(slots._group("").in_use)
+        return ChangeStatus("applied", "c1", window_s=60, left_s=20.0, reload_status=0)
+
+    monkeypatch.setattr(deadman, "status", status)
+    for is_reloaded, is_abandoned, leaving in (
+        (False, False, False),
+        (True, False, False),
+        (False, True, False),
+        (False, False, True),
+    ):
+        change = a_change()
+        change.is_reloaded, change.is_abandoned = is_reloaded, is_abandoned
+        cast("SimpleNamespace", change.ctx.run.interrupt).leaving = leaving
+        with slots.use("b01") as slot:
+            change_in_progress._while_it_reloads(change, CONNECTION, slot)
+    assert waits == [5, 0, 0, 0]
+    assert held == [0, 1, 1, 1]
+
+
+@pytest.mark.parametrize("address", ["10.42.0.101", "192.168.1.1"])
+def test_only_a_connection_to_the_new_address_is_kept(monkeypatch: pytest.MonkeyPatch, address: str) -> None:
+    """One to the former address, which the node may still have for a while, would never find it at the new one."""
+    change = a_change()
+    change.old = Endpoint("192.168.1.1")
+    cast("SimpleNamespace", change.ctx).name = "b01"
+    change.listener = cast("ChangeListener", SimpleNamespace(connecting=nullcontext))
+    closed: list[str] = []
+    connection = SimpleNamespace(endpoint=Endpoint(address), is_open=True, close=lambda: closed.append(address))
+    monkeypatch.setattr(commit_confirm, "connect", lambda _: connection)
+    monkeypatch.setattr(commit_confirm, "observe_and_decide", lambda *_, **__: Action.WAIT)
+    kept = _observe_once(change, None, ChannelSlots().acquire("b01"))
+    assert kept == (None, connection if address == "10.42.0.101" else None)
+    assert closed == ([] if address == "10.42.0.101" else ["192.168.1.1"])
 
 
 def logins_of(change: ChangeInProgress) -> dict[str, Deadlines]:
@@ -160,10 +203,10 @@ def test_neighbors_try_to_log_in_unless_the_change_may_drop_logins(files: tuple[
         raise Unreachable("no answer")
 
     cast("SimpleNamespace", change.ctx.run).connections = SimpleNamespace(open=refuse, deadlines=Deadlines())
-    assert _observe_once(change, None) == (None, None)
+    assert _observe_once(change, None, ChannelSlots().acquire("b01")) == (None, None)
     # its timer has rolled it back
     change.started_s -= change.window_s + ROLLBACK_S + 1
-    assert _observe_once(change, None) == (None, None)
+    assert _observe_once(change, None, ChannelSlots().acquire("b01")) == (None, None)
     assert calls == [is_due, True]
 
 
@@ -193,8 +236,8 @@ def test_a_change_that_left_no_trace_does_not_get_the_reason_of_an_earlier_one(
     change = SimpleNamespace(
         ctx=ctx, id="c1", started_s=None, status=status, unmet=(), login_refused="", connect_error="", last=None
     )
-    connection = cast("SshConnection", None)
-    assert commit_confirm._act(cast("ChangeInProgress", change), connection, is_proof=False) == outcome
+    connection, slot = cast("SshConnection", None), ChannelSlots().acquire("b01")
+    assert commit_confirm._act(cast("ChangeInProgress", change), connection, slot, is_proof=False) == outcome
 
 
 def test_the_window_of_a_scheduled_change_begins_at_its_moment(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,7 +7,7 @@ from types import MappingProxyType
 
 import pytest
 
-from meshctl.apply.mesh_commit import LEFT_BEHIND
+from meshctl.apply.participant import LEFT_BEHIND
 from meshctl.apply.prepare import Prepared
 from meshctl.apply.resume import resolutions
 from meshctl.device.observation import ChangeStatus

@@ -104,6 +104,29 @@ def test_an_applied_change_outlives_its_connection_and_rolls_back_on_timeout(
     assert is_before(node.path("/etc"))
 
 
+def test_a_look_is_answered_when_the_reload_has_ended(
+    connection: SshConnection, server: Server, node: Sandbox, tmp_path: Path
+) -> None:
+    """Otherwise a slow node gets a login every few seconds while its services reload."""
+    reloads = change(reload="until [ -e /harness/go ]; do sleep 1; done; exit 7")
+    prepare(node, reloads)
+    # of no change in progress, or before it starts: answered at once
+    assert deadman.status(connection, started="c1", await_reload_s=600).state == "idle"
+    deadman.lock(connection, OWNER, ttl_s=1000)
+    deadman.stage(connection, OWNER, reloads)
+    deadman.arm(connection, OWNER, "c1", nonce=NONCE, window_s=10000)
+    assert deadman.status(connection, started="c1", await_reload_s=600).state == "armed"
+    deadman.apply(connection, OWNER, "c1")
+    with log_in(server, node, tmp_path) as other, ThreadPoolExecutor(1) as pool:
+        short = deadman.status(connection, started="c1", await_reload_s=1)
+        look = pool.submit(deadman.status, connection, started="c1", await_reload_s=50)
+        eventually(lambda: deadman.status(other).state == "applied")
+        node.put("/harness/go", "")
+        seen = look.result()
+    assert (short.state in ("waiting", "applied"), short.reload_status) == (True, None)
+    assert (seen.state, seen.reload_status) == ("applied", 7)
+
+
 def test_a_refusal_carries_its_code_and_its_reason(connection: SshConnection, node: Sandbox) -> None:
     prepare(node)
     with pytest.raises(NodeRefused, match="take the lock first") as caught:
