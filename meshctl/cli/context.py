@@ -173,15 +173,23 @@ def trust_of(fleet: Fleet) -> TrustStore:
 def lab_at(given: Path | None, inventory: Path) -> tuple[LabFleet | None, str]:
     """The running virtual fleet, if one is given, and the directory of the lab that it or the inventory belongs to.
 
-    Prints a note when the inventory is a lab's and no fleet is given. Raises MeshctlError if no fleet runs there.
+    Prints a note when the inventory is a lab's and no fleet is given, or another one than that of the fleet. Raises
+    MeshctlError if no fleet runs there.
     """
-    from meshctl.fleet.lab_directory import lab_of
+    from meshctl.fleet.lab_directory import INVENTORY, lab_of
 
+    directory = lab_of(str(inventory.resolve()))
     if given is not None:
         virtual = attach_lab(given)
+        own = virtual.directory / INVENTORY
+        if own.is_dir() and directory != str(virtual.directory.resolve()):
+            echo(
+                f"note: {inventory} is not the inventory of the lab in {virtual.directory}, whose nodes may have other "
+                f"names at the same addresses: use -i {own}, or run `meshctl lab up` for this inventory",
+                err=True,
+            )
         return virtual, str(virtual.directory)
     # a lab's copy of the inventory also works without --lab
-    directory = lab_of(str(inventory.resolve()))
     if directory:
         # in another terminal, one of two variables is easily forgotten
         echo(

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
-from meshctl.cli.context import exit_for, session
+from meshctl.cli import context
+from meshctl.cli.context import exit_for, lab_at, session
 from meshctl.diagnostics import InvalidInput
 from meshctl.errors import ExitCode
 from meshctl.fleet import Interrupt, Outcome, Result
@@ -53,6 +55,22 @@ def test_a_lab_s_inventory_without_its_lab_is_noted(of_lab: Path, capsys: pytest
         "",
         f"note: the inventory is that of the lab in {lab}, but its addresses are used as those of real devices: "
         f"set MESHCTL_LAB={lab} to reach the lab\n",
+    )
+
+
+def test_another_inventory_than_that_of_the_lab_is_noted(
+    of_lab: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its names would stand for other nodes of the lab, which have the same addresses."""
+    lab = of_lab.parent
+    monkeypatch.setattr(context, "attach_lab", lambda directory: SimpleNamespace(directory=directory))
+    assert lab_at(lab, of_lab)[1] == lab_at(lab, of_lab / "fleet.yaml")[1] == str(lab)
+    assert capsys.readouterr() == ("", "")
+    write_starter(lab.parent / "fleet")
+    lab_at(lab, lab.parent / "fleet")
+    assert capsys.readouterr().err == (
+        f"note: {lab.parent}/fleet is not the inventory of the lab in {lab}, whose nodes may have other names at the "
+        f"same addresses: use -i {of_lab}, or run `meshctl lab up` for this inventory\n"
     )
 
 
