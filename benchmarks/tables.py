@@ -38,12 +38,13 @@ def verdict(met: bool) -> str:
     return "met" if met else "**missed**"
 
 
-def shown(figure: str, value: float | None) -> str:
+def shown(figure: str, value: float | None, *, more_digits: int = 0) -> str:
     if value is None:
         return "none"
     _, factor, form = _COLUMNS[figure]
     form, _, suffix = form.partition(" ")
-    return f"{value * factor:{form}}" + (f" {suffix}" if suffix else "")
+    digits = int(form.strip(".f")) + more_digits
+    return f"{value * factor:.{digits}f}" + (f" {suffix}" if suffix else "")
 
 
 def table(results: Sequence[Mapping[str, Any]]) -> str:
@@ -73,10 +74,9 @@ def report(results: Sequence[Mapping[str, Any]]) -> str:
         bound = goal.at_least if goal.at_least is not None else goal.at_most
         assert bound is not None
         sign = ">=" if goal.at_least is not None else "<="
-        goals.append(
-            row([goal.set, goal.cell, heading, f"{sign} {bound * factor:g}", shown(goal.figure, value),
-                 verdict(met)])
-        )  # fmt: skip
+        # one digit more than the bound has, or a goal missed by little would look met
+        measured = shown(goal.figure, value, more_digits=1)
+        goals.append(row([goal.set, goal.cell, heading, f"{sign} {bound * factor:g}", measured, verdict(met)]))
     parts += ["### goals\n\n" + "\n".join(goals), "### beside the best of the others\n\n" + _comparisons(results)]
     return "\n\n".join(parts) + "\n"
 
