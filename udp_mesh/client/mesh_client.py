@@ -35,6 +35,10 @@ MAX_HEADER_BYTES = 1 << 16
 MAX_REPLY_HEADER_BYTES = 1 << 26
 """Maximum header size of a reply or event: the status of a thousand peers takes some megabytes."""
 MAX_PAYLOAD_BYTES = 1 << 30
+MAX_UNREAD_BYTES = 1 << 26
+"""Of events that came before a reply and that the program has not taken yet. Beyond, the oldest are dropped."""
+EVENT_BYTES = 1 << 10
+"""What an event without payload is counted as."""
 _LENGTHS = struct.Struct(">II")
 _TIMEVALS = (struct.Struct("@ll"), struct.Struct("=qq"))
 """What a timeout of the kernel may be: the second, on 32-bit systems whose libc has 64-bit times."""
@@ -154,6 +158,8 @@ class MeshClient:
         self.timeout_s = timeout_s
         self._reader = FrameReader()
         self._events: Deque[Frame] = deque()
+        self._unread_bytes = 0
+        self._dropped = 0
         self._requests: Set[int] = set()
         """Requests whose reply a thread waits for; a later reply is dropped."""
         self._replies: Dict[int, Frame] = {}
@@ -331,8 +337,19 @@ class MeshClient:
 
     def next_frame(self, timeout_s: Optional[float] = None) -> Optional[Frame]:
         """The next event with its payload; None after `timeout_s` seconds. Raises MeshError when the daemon is gone or
-        the client was closed."""
-        return self._wait_for(lambda: self._events.popleft() if self._events else None, timeout_s)
+        the client was closed. An event "dropped" counts the messages that a program lost which made requests and did
+        not take their events."""
+        return self._wait_for(self._next_event, timeout_s)
+
+    def _next_event(self) -> Optional[Frame]:
+        if self._dropped:
+            dropped, self._dropped = self._dropped, 0
+            return {"event": "dropped", "messages": dropped}, b""
+        if not self._events:
+            return None
+        frame = self._events.popleft()
+        self._unread_bytes -= EVENT_BYTES + len(frame[1])
+        return frame
 
     # The socket
 
@@ -434,6 +451,11 @@ class MeshClient:
                     self._outcomes[header["request"]] = header
                 else:
                     self._events.append((header, payload))
+                    self._unread_bytes += EVENT_BYTES + len(payload)
+            while self._unread_bytes > MAX_UNREAD_BYTES and len(self._events) > 1:
+                header, payload = self._events.popleft()
+                self._unread_bytes -= EVENT_BYTES + len(payload)
+                self._dropped += header.get("event") == "message"
         return True
 
 

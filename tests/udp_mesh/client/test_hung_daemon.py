@@ -14,7 +14,8 @@ import pytest
 
 from tests.udp_mesh.links.sockets import WAIT_S
 from udp_mesh import MeshClient, MeshError
-from udp_mesh.client.mesh_client import FrameReader
+from udp_mesh.client import mesh_client
+from udp_mesh.client.mesh_client import FrameReader, encode_frame
 
 LARGE = bytes(2_000_000)
 SHORT_S = 0.05
@@ -96,6 +97,33 @@ def test_close_ends_a_publication_that_waits_for_the_daemon(listener: socket.soc
         thread.join(WAIT_S)
         assert not thread.is_alive()
     assert codes == ["closed"]
+
+
+def message(number: int, size: int) -> bytes:
+    header = {"event": "message", "source": "bob", "topic": "status", "type": "", "priority": 3, "broadcast": False}
+    return encode_frame({**header, "number": number}, bytes(size))
+
+
+def test_messages_that_a_program_does_not_take_are_dropped_beyond_a_limit(
+    listener: socket.socket, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each request reads what comes before its reply."""
+    monkeypatch.setattr(mesh_client, "MAX_UNREAD_BYTES", 4 * (1000 + mesh_client.EVENT_BYTES))
+    client, daemon = connect(listener, timeout_s=WAIT_S)
+    with client, daemon:
+        for number in range(10):
+            if number == 5:
+                daemon.sendall(encode_frame({"event": "peer-online", "peer": "bob"}))
+            daemon.sendall(message(number, size=1000))
+        daemon.sendall(encode_frame({"id": 1, "ok": True}))
+        assert client.request("status")["ok"]
+        assert client.next_frame(0) == ({"event": "dropped", "messages": 6}, b"")
+        assert [received.number for received in client.messages(0)] == [6, 7, 8, 9]
+        # what was taken no longer counts
+        daemon.sendall(b"".join(message(number, size=900) for number in (10, 11, 12, 13)))
+        daemon.sendall(encode_frame({"id": 2, "ok": True}))
+        assert client.request("status")["ok"]
+        assert [received.number for received in client.messages(0)] == [10, 11, 12, 13]
 
 
 def test_a_reply_after_its_timeout_is_dropped(listener: socket.socket) -> None:
