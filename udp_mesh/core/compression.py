@@ -148,31 +148,29 @@ class Uncompressed:
 class CompressionQueue:
     """Messages waiting to be compressed: in the order accepted within a topic, the most urgent topic first."""
 
-    __slots__ = ("_in_progress", "_topics", "bytes")
+    __slots__ = ("_in_progress", "bytes", "topics")
 
     def __init__(self) -> None:
-        self._topics: dict[str, deque[Uncompressed]] = {}
+        self.topics: dict[str, deque[Uncompressed]] = {}
+        """The messages of each topic that has any."""
         self._in_progress: dict[str, Compression | ZstdCompression] = {}
         self.bytes = 0
 
-    def __len__(self) -> int:
-        return len(self._topics)
-
     def has_topic(self, topic: str) -> bool:
         """Whether a message of this topic waits, so that later ones must wait behind it."""
-        return topic in self._topics
+        return topic in self.topics
 
     def add(self, message: Uncompressed) -> None:
-        self._topics.setdefault(message.channel.name, deque()).append(message)
+        self.topics.setdefault(message.channel.name, deque()).append(message)
         self.bytes += len(message.payload)
 
     def step(self) -> tuple[Uncompressed, bytes | None] | None:
         """Compress one step. Returns a message and its compressed body (None: send it uncompressed) when one is
         done."""
-        name = min(self._topics, key=lambda topic: self._topics[topic][0].channel.topic.priority)
+        name = min(self.topics, key=lambda topic: self.topics[topic][0].channel.topic.priority)
         compression = self._in_progress.get(name)
         if compression is None:
-            first = self._topics[name][0]
+            first = self.topics[name][0]
             compression = self._in_progress[name] = start_compression(first.payload, zstd=first.zstd)
         if not compression.step():
             return None
@@ -182,12 +180,12 @@ class CompressionQueue:
     def drain(self) -> list[Uncompressed]:
         """Remove and return everything uncompressed, because the node closes."""
         self._in_progress.clear()
-        return [self._pop(name) for name in list(self._topics) for _ in range(len(self._topics[name]))]
+        return [self._pop(name) for name in list(self.topics) for _ in range(len(self.topics[name]))]
 
     def _pop(self, name: str) -> Uncompressed:
-        waiting = self._topics[name]
+        waiting = self.topics[name]
         message = waiting.popleft()
         if not waiting:
-            del self._topics[name]
+            del self.topics[name]
         self.bytes -= len(message.payload)
         return message

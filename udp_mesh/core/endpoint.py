@@ -95,7 +95,7 @@ class Endpoint:
                 data = inner
         if len(data) and data[0] == RELAY_BYTE:
             self._relaying.receive(data, link, source, now)
-        elif len(data) and data[0] < MARK and self._legacy:
+        elif len(data) and data[0] < MARK and self._legacy.by_host:
             self._legacy.receive(data, link, source, now)
         else:
             receive_datagram(self._state, data, link, source, now)
@@ -108,7 +108,7 @@ class Endpoint:
         if self._logs is not None:
             self._logs.process(now)
         out = self._relaying.transmit(transmit.collect(self._state, now, max_bytes), now, max_bytes)
-        if self._legacy:
+        if self._legacy.by_host:
             out = self._legacy.encapsulate_broadcasts(out)
             self._legacy.send(now, out)
         if out:
@@ -123,7 +123,7 @@ class Endpoint:
         at = min(at, self._relaying.next_at(), self.selective.next_at)
         if self.thin is not None:
             at = min(at, self.thin.next_at())
-        if self._legacy:
+        if self._legacy.by_host:
             at = min(at, self._legacy.next_at())
         return at if self._logs is None else min(at, self._logs.next_at)
 
@@ -134,7 +134,7 @@ class Endpoint:
         self.selective.handle_timer(now)
         if self.thin is not None:
             self.thin.handle_timer(now)
-        if self._legacy:
+        if self._legacy.by_host:
             self._legacy.handle_timer(now)
 
     @property
@@ -142,14 +142,14 @@ class Endpoint:
         """Whether `datagrams_to_send` may return something. False right after it returned everything."""
         if self._logs is not None and self._logs.has_work:
             return True
-        return bool(self._legacy) or self._relaying.has_work or transmit.has_datagrams(self._state)
+        return bool(self._legacy.by_host) or self._relaying.has_work or transmit.has_datagrams(self._state)
 
     def is_due_before(self, at: float) -> bool:
         """Whether a call of `send` may have moved `next_timer` to before `at`; cheaper than reading that."""
         if self.thin is not None and self.thin.next_at() < at:
             return True
         soon = min(self._state.next_peer_at(), self._state.selection.next_at)
-        return soon < at or bool(self._state.compression_queue or self._state.versions.has_work)
+        return soon < at or bool(self._state.compression_queue.topics or self._state.versions.has_work)
 
     @property
     def is_quiet(self) -> bool:
@@ -159,7 +159,7 @@ class Endpoint:
         """
         if self._logs is not None and self._logs.has_work:
             return False
-        return not self._legacy and not self._relaying.has_work and transmit.is_quiet(self._state)
+        return not self._legacy.by_host and not self._relaying.has_work and transmit.is_quiet(self._state)
 
     def next_event(self) -> Event | None:
         """The oldest event not yet fetched."""

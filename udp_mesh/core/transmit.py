@@ -18,6 +18,7 @@ from udp_mesh.core.publish import broadcast_room, compress_step, expire_held, re
 from udp_mesh.core.sender.message import OutgoingMessage
 from udp_mesh.core.sender.packetizer import send_copies, send_level
 from udp_mesh.core.sender.path import IP_UDP_BYTES
+from udp_mesh.core.sender.sender import Sender
 from udp_mesh.core.settings import RELAY_LINK, Address, LinkKind
 from udp_mesh.core.state import MAINTENANCE_INTERVAL_S, State
 from udp_mesh.wire.codec import encode
@@ -125,7 +126,7 @@ def _send_control(state: State, session: Session, now: float, out: list[Datagram
 def _send_levels(state: State, now: float, out: list[Datagram], room: int) -> None:
     allowed = state.priority_backoff.allowed_levels(now)
     broadcasts = state.broadcasts
-    peers: list[Peer] = []
+    peers: list[tuple[Peer, Sender]] = []
     mask = broadcasts.waiting
     for peer in list(state.ready):
         sender = peer.open_sender()
@@ -135,7 +136,7 @@ def _send_levels(state: State, now: float, out: list[Datagram], room: int) -> No
             continue
         if sender.cancelled and not sender.scheduler.waiting:
             state.schedule_control(session)
-        if sender.copies:
+        if sender.copies.next_at <= now:
             send_copies(sender, session.path, now, out)
         if sender.scheduler.waiting:
             if (
@@ -147,7 +148,7 @@ def _send_levels(state: State, now: float, out: list[Datagram], room: int) -> No
                 number, data = session.path.seal(encode([introduction(state, session, now)]))
                 sender.in_flight.add(number, None)
                 out.append(Datagram(session.path.link, session.path.address, data, True))
-            peers.append(peer)
+            peers.append((peer, sender))
             sender.wake_at = _INFINITY
             sender.packing.waiting = 0
             mask |= sender.scheduler.waiting
@@ -168,8 +169,7 @@ def _send_levels(state: State, now: float, out: list[Datagram], room: int) -> No
             _send_broadcasts(state, priority, now, out)
             room -= sum(len(datagram.data) for datagram in out[before:])
             _set_relayed_aside(state, priority, out, before)
-        for peer in peers:
-            sender = peer.open_sender()
+        for peer, sender in peers:
             if not sender.scheduler.waiting & bit:
                 continue
             session = peer.session
@@ -185,8 +185,7 @@ def _send_levels(state: State, now: float, out: list[Datagram], room: int) -> No
                 # A peer that used up the room is served last next time.
                 state.ready[peer] = state.ready.pop(peer)
                 break
-    for peer in peers:
-        sender = peer.open_sender()
+    for peer, sender in peers:
         if sender.served:
             sender.levels.record_served(sender.served, sender.scheduler.waiting, now)
             sender.served = 0
@@ -258,7 +257,8 @@ def next_timer(state: State) -> float | None:
     for bucket in state.rate_limits.values():
         if bucket.has_parked:
             at = min(at, bucket.ready_at())
-    if (state.compression_queue or state.inflating or state.versions.has_work) and not state.closed:
+    has_steps = state.compression_queue.topics or state.inflating or (state.versions.jobs and state.versions.has_work)
+    if has_steps and not state.closed:
         # Due at once, repeatedly; other timers are handled in between.
         return _ALWAYS
     return None if at == _INFINITY or state.closed else at
@@ -304,11 +304,11 @@ def handle_timer(state: State, now: float) -> None:
     broadcasts: list[Datagram] = []
     state.broadcasts.send_copies(now, broadcasts)
     state.outgoing.extend(broadcasts)
-    if state.compression_queue:
+    if state.compression_queue.topics:
         compress_step(state, now)
     if state.inflating:
         inflate_step(state, now)
-    if state.versions.has_work and (prepared := state.versions.step()) is not None:
+    if state.versions.jobs and state.versions.has_work and (prepared := state.versions.step()) is not None:
         _restore(state, *prepared)
     if state.maintenance_at <= now:
         state.maintenance_at = now + MAINTENANCE_INTERVAL_S

@@ -12,10 +12,11 @@ from udp_mesh.wire.errors import DecodeError
 class Reader:
     """Reads one slice from front to back; a read past its end raises `DecodeError`."""
 
-    __slots__ = ("_data", "_position")
+    __slots__ = ("_data", "_position", "_size")
 
     def __init__(self, data: bytes | bytearray | memoryview, position: int = 0) -> None:
         self._data = memoryview(data)
+        self._size = len(data)
         self._position = position
 
     @property
@@ -23,12 +24,12 @@ class Reader:
         return self._position
 
     def remaining(self) -> int:
-        return len(self._data) - self._position
+        return self._size - self._position
 
     def take(self, count: int, what: str) -> memoryview:
         """The next `count` bytes as a view."""
         end = self._position + count
-        if count < 0 or end > len(self._data):
+        if count < 0 or end > self._size:
             raise DecodeError(f"{what}: expected {count} bytes, found {self.remaining()}")
         view = self._data[self._position : end]
         self._position = end
@@ -36,7 +37,12 @@ class Reader:
 
     def integer(self, width_bytes: int, what: str) -> int:
         """The next unsigned big-endian integer."""
-        return int.from_bytes(self.take(width_bytes, what), "big")
+        end = self._position + width_bytes
+        if end > self._size:
+            raise DecodeError(f"{what}: expected {width_bytes} bytes, found {self.remaining()}")
+        value = int.from_bytes(self._data[self._position : end], "big")
+        self._position = end
+        return value
 
     def at_most(self, width_bytes: int, limit: int, what: str) -> int:
         """An integer that may not exceed `limit`."""

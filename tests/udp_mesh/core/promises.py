@@ -128,7 +128,8 @@ def check_finished(team: RandomTeam) -> None:
             sender = peer.sender
             if sender is None:
                 continue
-            if sender.pending or sender.in_flight.outstanding or sender.timed_out or sender.copies:
+            has_copies = sender.copies.next_at < float("inf")
+            if sender.pending or sender.in_flight.outstanding or sender.timed_out or has_copies:
                 raise Broken(f"{name} has not finished with {peer.name}: {_shown(peer)}")
             if not peer.online:
                 raise Broken(f"{name} does not reach {peer.name}")
@@ -153,7 +154,7 @@ def _shown(peer: Peer) -> str:
     return (
         f"{sender.state.name}, {len(sender.pending)} pending, {sender.in_flight.outstanding} in flight, "
         f"{len(sender.timed_out)} timed out, levels {sender.scheduler.waiting:b} waiting, "
-        f"{len(sender.unconfirmed)} unconfirmed, copies {bool(sender.copies)}"
+        f"{len(sender.unconfirmed)} unconfirmed, next copy at {sender.copies.next_at}"
     )
 
 

@@ -132,7 +132,7 @@ def test_messages_of_one_topic_keep_their_order_behind_one_that_is_being_compres
         made.nodes["a"].send("map", payload, destination="b", now=made.now)
     made.nodes["a"].send("tiles", b"more urgent", destination="b", now=made.now)
     sender = made.nodes["a"]._state.peer_table.peers["b"].open_sender()
-    while made.nodes["a"]._state.compression_queue:
+    while made.nodes["a"]._state.compression_queue.topics:
         made.nodes["a"].handle_timer(made.now)
     assert [len(message.accepted.payload) for message in sender.pending] == [11, len(MAP), 6, 3 * STEP_BYTES, 6]
     assert made.run(60.0, until=lambda: len(made.events_of("a", MessageDelivered)) == 5)

@@ -329,7 +329,7 @@ def test_defect_8_a_number_still_in_use_is_not_given_to_a_new_message() -> None:
     old = OldRobot()
     old.node.send("map", b"held", destination="old", now=old.now)
     (held,) = old.hear_messages()
-    sender = next(iter(old.node._legacy._by_host.values())).sender
+    sender = next(iter(old.node._legacy.by_host.values())).sender
     sender._sequence = (held.sequence - 2) % LAST_SEQUENCE
     numbers = {sender._next_sequence() for _ in range(3)}
     assert held.sequence not in numbers
@@ -337,7 +337,7 @@ def test_defect_8_a_number_still_in_use_is_not_given_to_a_new_message() -> None:
 
 def test_defect_9_priority_order_survives_the_wrap_of_the_sequence_numbers() -> None:
     old = OldRobot()
-    sender = next(iter(old.node._legacy._by_host.values())).sender
+    sender = next(iter(old.node._legacy.by_host.values())).sender
     sender._sequence = LAST_SEQUENCE - 1
     for number in range(6):
         old.node.send("map", bytes([number]), destination="old", now=old.now)
@@ -453,7 +453,7 @@ def test_each_run_starts_at_a_random_legacy_sequence_number() -> None:
         rng = random.Random(seed)
         config = replace(settings("new"), neighbours=(Neighbour(OLD, name="old", legacy=True),))
         node = Endpoint(config, boot_id=rng.randbytes(16), rng=rng, now=0.0)
-        numbers.add(next(iter(node._legacy._by_host.values())).sender._next_sequence())
+        numbers.add(next(iter(node._legacy.by_host.values())).sender._next_sequence())
     assert len(numbers) == 5
     assert all(1 <= number <= LAST_SEQUENCE for number in numbers)
 

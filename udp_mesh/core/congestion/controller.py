@@ -58,7 +58,8 @@ class CongestionController(Protocol):
         ...
 
     def assume_delivery(self) -> bool:
-        """Whether the link can be assumed to keep delivering while acknowledgments are late."""
+        """Whether the link can be assumed to keep delivering while acknowledgments are late, unless a queue that our
+        window does not explain keeps it busy anyway."""
         ...
 
     def is_queue_explained(self) -> bool:

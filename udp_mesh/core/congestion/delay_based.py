@@ -167,14 +167,14 @@ class DelayBasedController:
         self._suspect_interval_s = SUSPECT_DRAIN_INTERVAL_S
 
     def capacity_packets_per_s(self) -> float | None:
-        return self._rate.maximum()
+        return self._rate.maximum
 
     def is_capacity_current(self, now: float) -> bool:
         return self._rate.is_current(now)
 
     def assume_delivery(self) -> bool:
-        # A queue that our window does not explain keeps the link busy anyway, and a drain wants the queue empty.
-        return bool(self._rate) and self.phase in (Phase.STARTUP, Phase.CRUISE) and self.is_queue_explained()
+        # A drain wants the queue empty.
+        return self.phase in (Phase.STARTUP, Phase.CRUISE) and bool(self._rate)
 
     def is_queue_explained(self) -> bool:
         return not self._unexplained_queue()
@@ -226,7 +226,7 @@ class DelayBasedController:
             self._competition.on_lost(lost)
         if rate is not None:
             self._rate.add(rate, app_limited=app_limited, now=now)
-            rtt.packet_s = 1.0 / (self.capacity_packets_per_s() or float("inf"))
+            rtt.packet_s = 1.0 / (self._rate.maximum or float("inf"))
         self._last_rtts.append(rtt.latest_rtt)
         self._uncontended_acks = self._uncontended_acks + 1 if ahead < MIN_CWND - 1 else 0
         if app_limited and self._uncontended_acks >= 4 and min(self._last_rtts) > 1.15 * rtt.min_rtt + STARTUP_QUEUE_S:
@@ -270,9 +270,11 @@ class DelayBasedController:
         min_rtt, windowed_rtt = self._rtt.min_rtt, self._rtt.windowed_rtt
         if min_rtt is None or windowed_rtt is None:
             return False
+        unexplained_s = windowed_rtt - min_rtt - SUSPECT_QUEUE_S - 0.25 * min_rtt
+        if unexplained_s <= 0.0:
+            return False
         # On a short lossy path the smallest window is a queue by itself.
-        explained_s = max(0.0, self._min_cwnd() / (self.capacity_packets_per_s() or float("inf")) - min_rtt)
-        return windowed_rtt - min_rtt > explained_s + SUSPECT_QUEUE_S + 0.25 * min_rtt
+        return unexplained_s > self._min_cwnd() / (self._rate.maximum or float("inf")) - min_rtt
 
     def _min_rtt_is_verified(self) -> bool:
         """Whether the minimum RTT was seen with next to nothing in flight; otherwise it may include a standing
@@ -285,7 +287,7 @@ class DelayBasedController:
 
     def _jitter_s(self) -> float:
         """Serialization time of the packets left in flight by a drain, plus a radio's jitter."""
-        return STARTUP_QUEUE_S / 3 + (MIN_CWND - 1) / (self.capacity_packets_per_s() or float("inf"))
+        return STARTUP_QUEUE_S / 3 + (MIN_CWND - 1) / (self._rate.maximum or float("inf"))
 
     def _update(self, *, app_limited: bool, now: float) -> None:
         min_rtt, windowed_rtt = self._rtt.min_rtt, self._rtt.windowed_rtt
@@ -359,7 +361,7 @@ class DelayBasedController:
         assert min_rtt is not None
         if min_rtt < SERIALIZED_MIN_RTT_S:
             return QUEUE_S / 4
-        return min(STARTUP_QUEUE_S, QUEUE_S / 4 + 1.0 / (self.capacity_packets_per_s() or float("inf")))
+        return min(STARTUP_QUEUE_S, QUEUE_S / 4 + 1.0 / (self._rate.maximum or float("inf")))
 
     def _queue_packets(self, windowed_rtt: float) -> float:
         return self._shared_queue(self._target_queue_s() + loss_queue_s(self._loss), self.cwnd / windowed_rtt)

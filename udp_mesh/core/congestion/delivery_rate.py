@@ -7,19 +7,16 @@ RATE_WINDOW_S = 2.0
 
 
 class DeliveryRate:
-    """Packets per second."""
+    """Packets per second. `maximum` is the capacity of the path; None before the first sample."""
 
-    __slots__ = ("_samples",)
+    __slots__ = ("_samples", "maximum")
 
     def __init__(self) -> None:
         self._samples: deque[tuple[float, float]] = deque()
+        self.maximum: float | None = None
 
     def __bool__(self) -> bool:
         return bool(self._samples)
-
-    def maximum(self) -> float | None:
-        """The capacity of the path; None before the first sample."""
-        return self._samples[0][1] if self._samples else None
 
     def is_current(self, now: float) -> bool:
         """Whether the maximum is a sample within the window: of an application-limited sender the last one stays."""
@@ -30,11 +27,12 @@ class DeliveryRate:
         samples = self._samples
         while samples and samples[0][0] < now - RATE_WINDOW_S and not (app_limited and len(samples) == 1):
             samples.popleft()
-        if app_limited and (not samples or rate < samples[0][1]):
-            return
-        while samples and samples[-1][1] <= rate:
-            samples.pop()
-        samples.append((now, rate))
+        if not app_limited or (samples and rate >= samples[0][1]):
+            while samples and samples[-1][1] <= rate:
+                samples.pop()
+            samples.append((now, rate))
+        self.maximum = samples[0][1] if samples else None
 
     def clear(self) -> None:
         self._samples.clear()
+        self.maximum = None

@@ -110,7 +110,7 @@ class LegacyPeer:
 class LegacyPeers:
     """All legacy peers by host address. `next_at` is when something is due."""
 
-    __slots__ = ("_by_host", "_heartbeat_at", "_restored", "_state", "accepted")
+    __slots__ = ("_heartbeat_at", "_restored", "_state", "accepted", "by_host")
 
     def __init__(self, state: State, positions: Mapping[str, ReceivePosition]) -> None:
         """`positions` are those of the previous run, by peer."""
@@ -118,24 +118,25 @@ class LegacyPeers:
         self._restored = dict(positions)
         self.accepted = 0
         """Datagrams of configured addresses. Nothing authenticates them."""
-        self._by_host: dict[str, LegacyPeer] = {}
+        self.by_host: dict[str, LegacyPeer] = {}
+        """The configured peers by their host's address."""
         self._heartbeat_at = float("-inf")
         self.apply()
 
     def apply(self) -> None:
         """Apply the settings' neighbors; peers that stay keep their state."""
         desired = {neighbour.address[0]: neighbour for neighbour in self._state.settings.neighbours if neighbour.legacy}
-        for host in list(self._by_host):
-            if host not in desired or self._by_host[host].neighbour != desired[host]:
-                self._drop(self._by_host.pop(host))
+        for host in list(self.by_host):
+            if host not in desired or self.by_host[host].neighbour != desired[host]:
+                self._drop(self.by_host.pop(host))
         for host, neighbour in desired.items():
-            if host not in self._by_host and neighbour.name is not None:
+            if host not in self.by_host and neighbour.name is not None:
                 peer = self._state.peer_table.get_or_create(neighbour.name, self._state.settings)
                 if peer is not None:
                     peer.legacy = True
                     peer.transition(PeerEvent.CONFIGURED)
                     position = self._restored.pop(neighbour.name, None)
-                    self._by_host[host] = LegacyPeer(neighbour, peer, self._state.settings, self._state.rng, position)
+                    self.by_host[host] = LegacyPeer(neighbour, peer, self._state.settings, self._state.rng, position)
 
     def _drop(self, removed: LegacyPeer) -> None:
         """Remove a peer no longer configured; forget it completely if it was never heard and nothing waits for it."""
@@ -147,9 +148,6 @@ class LegacyPeers:
             state.ready.pop(peer, None)
             del state.peer_table.peers[peer.name]
 
-    def __len__(self) -> int:
-        return len(self._by_host)
-
     def positions(self) -> dict[str, ReceivePosition]:
         """The receive position of each peer, for the next run of this node."""
         known = ((legacy.peer.name, legacy.acks.position()) for legacy in self._active())
@@ -158,7 +156,7 @@ class LegacyPeers:
     def receive(self, data: bytes | memoryview, link: str, source: Address, now: float) -> None:
         """Process a datagram without our mark: the legacy format from a configured address, or foreign."""
         counters = self._state.event_queue.counters
-        legacy = self._by_host.get(source[0])
+        legacy = self.by_host.get(source[0])
         if legacy is None or legacy.is_upgraded() or source != legacy.neighbour.address:
             # Legacy programs send from the port they listen on; other ports of that computer are not trusted.
             counters.dropped_unauthenticated += 1
@@ -271,7 +269,7 @@ class LegacyPeers:
 
     def next_at(self) -> float:
         """When `handle_timer` is due."""
-        if not self._by_host:
+        if not self.by_host:
             return float("inf")
         at = self._heartbeat_at
         for legacy in self._active():
@@ -285,7 +283,7 @@ class LegacyPeers:
         for legacy in self._active():
             if legacy.link:
                 self._acknowledge(legacy, legacy.acks.due(now))
-        if not self._by_host or now < self._heartbeat_at:
+        if not self.by_host or now < self._heartbeat_at:
             return
         # This process was suspended for that long: the silence was ours.
         suspended_s = now - self._heartbeat_at if self._heartbeat_at != float("-inf") else 0.0
@@ -321,7 +319,7 @@ class LegacyPeers:
                 state.outgoing.append(Datagram(link.name, legacy.neighbour.address, host, True))
 
     def _active(self) -> list[LegacyPeer]:
-        return [legacy for legacy in self._by_host.values() if not legacy.is_upgraded()]
+        return [legacy for legacy in self.by_host.values() if not legacy.is_upgraded()]
 
     def _links(self, legacy: LegacyPeer) -> list[LinkInfo]:
         # The legacy format has room for an IPv4 address only.

@@ -25,23 +25,19 @@ the gaps grow."""
 ANSWER_GAPS = 3
 """An early copy is left out if the answer is overdue at most so many gaps later: then comes one only if needed."""
 
+_NEVER = float("inf")
+
 
 class RedundantCopies:
-    """The copies scheduled for one peer."""
+    """The copies scheduled for one peer; `next_at` is when the next one is due (infinite: there is none)."""
 
-    __slots__ = ("_heap", "_serial")
+    __slots__ = ("_heap", "_serial", "next_at")
 
     def __init__(self) -> None:
         self._heap: list[tuple[float, int, OutgoingMessage, int, int]] = []
         """(when, serial, message, position, how often it may be scheduled again)."""
         self._serial = 0
-
-    def __bool__(self) -> bool:
-        return bool(self._heap)
-
-    def next_at(self) -> float:
-        """When the next copy is due. Call only if there are any."""
-        return self._heap[0][0]
+        self.next_at = _NEVER
 
     def schedule(
         self,
@@ -76,11 +72,14 @@ class RedundantCopies:
             fragments.append((message, position))
             if times:
                 self._push(now + urgent_timeout_s, message, position, times - 1)
+        self.next_at = self._heap[0][0] if self._heap else _NEVER
         return fragments
 
     def clear(self) -> None:
         self._heap.clear()
+        self.next_at = _NEVER
 
     def _push(self, at: float, message: OutgoingMessage, position: int, times: int) -> None:
         self._serial += 1
         heappush(self._heap, (at, self._serial, message, position, times))
+        self.next_at = self._heap[0][0]

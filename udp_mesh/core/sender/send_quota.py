@@ -41,9 +41,11 @@ def cwnd_room(sender: Sender, now: float) -> int:
     """Packets that the window has room for; negative if more are in flight."""
     congestion = sender.congestion
     packets = congestion.cwnd
-    if congestion.assume_delivery():
-        packets = _with_assumed_delivery(sender, packets, now)
     if congestion.is_queue_explained():
+        # before that no acknowledgment is late
+        is_late = sender.state is SendState.TIMING_OUT or now - sender.last_progress > LATE_AFTER_S
+        if is_late and congestion.assume_delivery():
+            packets = _with_assumed_delivery(sender, packets, now)
         # Copies are few and small. While the queue is longer than we know why, they take the place of bulk.
         packets += sender.in_flight.copies
     room = int(packets) - sender.in_flight.outstanding
@@ -99,6 +101,7 @@ def next_send_at(sender: Sender, room: int, now: float, packets_per_s: float | N
         sender.state is SendState.TIMING_OUT
         or now >= late_at + ASSUMED_DELIVERY_S
         or not sender.congestion.assume_delivery()
+        or not sender.congestion.is_queue_explained()
     ):
         return None
     return max(now, late_at) + sender.rates.pace_quantum_s

@@ -254,11 +254,9 @@ class Sender(PendingMessages):
         deadline = self.next_deadline()
         if deadline is not None and (at is None or deadline < at):
             at = deadline
-        wake_at = min(self.wake_at, self.pmtu.comparisons.next_at)
+        wake_at = min(self.wake_at, self.pmtu.comparisons.next_at, self.copies.next_at)
         if wake_at != float("inf") and (at is None or wake_at < at):
             at = wake_at
-        if self.copies and (at is None or self.copies.next_at() < at):
-            at = self.copies.next_at()
         return at
 
     def pto_s(self) -> float:

@@ -35,8 +35,8 @@ def sendings(
     copies = RedundantCopies()
     copies.schedule(message, 0, 0.0, gap_s=GAP_S, twice=twice, loss=loss, urgent_timeout_s=overdue_s)
     times = []
-    while copies:
-        at = copies.next_at()
+    while copies.next_at < float("inf"):
+        at = copies.next_at
         if at >= answered_at:
             message.arrived[0] = 1
         times += [at for _ in copies.pop_due(at, overdue_s)]
