@@ -123,6 +123,7 @@ def plan(
 def apply(
     plan_file: Annotated[Path, typer.Argument(help="Plan written by `meshctl plan --out`.")],
     inventory: InventoryPath = Path(),
+    yes: Annotated[bool, typer.Option("--yes", "-y", help="Ignored: apply never asks.", hidden=True)] = False,
     dry_run: DryRun = False,
     rate: Rate = None,
     reconnect: Reconnect = False,

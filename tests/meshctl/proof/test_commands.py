@@ -25,7 +25,7 @@ def test_a_saved_plan_is_applied_and_a_node_changed_since_is_refused(rig: Rig) -
     file = rig.directory / "plan.json"
     assert rig.meshctl("plan", new, "--brief", "--out", str(file)).code == 0
     rig.fleet.node("n001").exec("uci set system.@system[0].log_size=999 && uci commit system").check("edit by hand")
-    applied = rig.meshctl("apply", new, str(file), "--json")
+    applied = rig.meshctl("apply", new, str(file), "--yes", "--json")
     expected = {name: "refused" if name == "n001" else "done" for name in ("base", *rig.names)}
     assert (applied.code, applied.results) == (1, expected), applied.err
     assert rig.state_of("n002", old, new) == "new"
