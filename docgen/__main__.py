@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import sys
+import argparse
 from pathlib import Path
 
 from docgen.pages import man_pages, pages
@@ -15,4 +15,6 @@ def main(directory: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    parser = argparse.ArgumentParser(prog="python -m docgen", description=__doc__)
+    parser.add_argument("directory", type=Path)
+    main(parser.parse_args().directory)
