@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import Future
 from dataclasses import dataclass
 
 from meshctl.apply.change_in_progress import ChangeInProgress
@@ -45,6 +46,8 @@ class Participant:
     is_confirmed: bool = False
     # a connection that was opened after its services had reloaded, kept until the node has proven itself
     proof: SshConnection | None = None
+    # the look at it that is queued, or in progress
+    look: Future[None] | None = None
 
     @property
     def name(self) -> str:
@@ -62,6 +65,17 @@ class Participant:
     @property
     def leaves_cell(self) -> bool:
         return bool(self.ctx.plan.splits)
+
+    def await_look(self) -> None:
+        """Wait for the end of the look in progress. Raises what it raised."""
+        if self.look is not None:
+            self.look.result()
+            self.look = None
+
+    def cancel_look(self) -> None:
+        """Drop the look if it has not begun."""
+        if self.look is not None and self.look.cancel():
+            self.look = None
 
     def take_proof(self) -> SshConnection | None:
         """The kept connection, if it is still open."""
