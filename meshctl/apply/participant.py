@@ -144,6 +144,9 @@ def unmet_of(participant: Participant) -> str:
     change = participant.change
     if change is None or participant.is_unreachable or not change.unmet:
         last_error = "" if change is None else change.last_error
+        if not (participant.is_unreachable or last_error):
+            # the first look at it is still in progress
+            return f"{participant.name}: it was not observed"
         return f"{participant.name}: it does not answer{f' ({last_error})' if last_error else ''}"
     return f"{participant.name}: {', '.join(change.unmet)}"
 

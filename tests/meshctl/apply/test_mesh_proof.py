@@ -14,7 +14,7 @@ from meshctl.apply import mesh_commit, mesh_proof
 from meshctl.apply.change_in_progress import ChangeInProgress
 from meshctl.apply.context import NodeContext, RunContext
 from meshctl.apply.next_action import Action
-from meshctl.apply.participant import Participant
+from meshctl.apply.participant import Participant, unmet_of
 from meshctl.device.connection import Endpoint
 from meshctl.fleet import Interrupt, Result
 from meshctl.nodes.backoff import Backoff
@@ -122,6 +122,23 @@ def test_the_decision_does_not_wait_for_a_look_that_hangs(monkeypatch: pytest.Mo
         decided.set()
         far.await_look()
     assert seen == [True]
+
+
+@pytest.mark.parametrize(
+    ("is_unreachable", "last_error", "expected"),
+    [
+        (False, "", "b01: it was not observed"),
+        (True, "", "b01: it does not answer"),
+        (False, "silent for 20 s", "b01: it does not answer (silent for 20 s)"),
+    ],
+)
+def test_a_node_whose_first_look_is_in_progress_is_not_said_to_be_away(
+    is_unreachable: bool, last_error: str, expected: str
+) -> None:
+    """Seen on real OpenWrt, after the second Ctrl-C: the base was about to answer."""
+    change = cast("ChangeInProgress", SimpleNamespace(unmet=(), last_error=last_error))
+    ctx = cast("NodeContext", SimpleNamespace(name="b01"))
+    assert unmet_of(Participant(ctx, change=change, is_unreachable=is_unreachable)) == expected
 
 
 def test_a_node_whose_look_ends_after_the_decision_is_confirmed_after_the_others(
