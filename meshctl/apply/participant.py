@@ -181,6 +181,8 @@ def unconfirmed_outcome(participant: Participant) -> Outcome:
         participant.name,
         Result.UNCERTAIN,
         f"left behind: the others are in the new cell, it rolls back to the old one ({unmet})",
-        hint="connect it by cable and run `meshctl resume`, or change the mesh back to the old cell",
+        # it does not answer the plan of the change back, which brings it into the mesh again
+        hint="connect it by cable and run `meshctl resume`, or change the mesh back to the old cell with "
+        f"`--leave-behind {participant.name}`",
         facts={LEFT_BEHIND: ", ".join(participant.ctx.plan.splits)},
     )

@@ -25,6 +25,7 @@ from meshctl.apply.participant import (
     lead_s,
     quorum_of,
     short_of_quorum,
+    unconfirmed_outcome,
 )
 from meshctl.device.errors import NodeRefused
 from meshctl.device.observation import ChangeStatus, Observation
@@ -336,3 +337,12 @@ def test_an_entry_node_that_a_power_cut_has_rolled_back_is_not_said_to_have_fail
     base = Participant(cast("NodeContext", SimpleNamespace(name="base")), change=change, has_failed=True)
     assert entries_lost([base], ["base"]) == "the base rolled back"
     assert cause_of(base) == "base: its power was cut, or it rebooted, before it was confirmed"
+
+
+def test_the_way_back_of_a_node_that_was_left_behind_names_the_option_it_needs() -> None:
+    """Seen on real OpenWrt: the change back was refused, because it "would leave behind" the node in that very cell."""
+    change = cast("ChangeInProgress", SimpleNamespace(is_confirm_unanswered=False, unmet=()))
+    ctx = cast("NodeContext", SimpleNamespace(name="b03", plan=SimpleNamespace(splits=("radio0: channel 6 -> 11",))))
+    left = unconfirmed_outcome(Participant(ctx, change=change))
+    assert left.result is Result.UNCERTAIN
+    assert left.hint.endswith("change the mesh back to the old cell with `--leave-behind b03`")
