@@ -25,13 +25,13 @@ from meshctl.apply.change_in_progress import (
     confirm,
     connect,
     new_change,
-    observe_and_decide,
     start,
     unlock,
 )
 from meshctl.apply.commit_confirm import GRACE_AFTER_WINDOW_S, poll
 from meshctl.apply.context import NodeContext, RunContext
 from meshctl.apply.first_boot import await_first_boot
+from meshctl.apply.mesh_proof import prove, prove_until
 from meshctl.apply.participant import (
     Participant,
     canceled_because,
@@ -128,6 +128,7 @@ def commit_mesh(
             return _decide(commit, needed)
         finally:
             for participant in participants:
+                participant.await_look()
                 if (unused := participant.take_proof()) is not None:
                     unused.close()
 
@@ -249,17 +250,8 @@ def _decide(commit: _MeshCommit, needed: Mapping[str, int]) -> dict[str, Outcome
     commit.run.interrupt.wait(
         max(participant.change.first_look_s for participant in commit.participants if participant.change is not None)
     )
-    while True:
-        commit.each([participant for participant in commit.participants if not participant.is_decided], _prove)
-        proven = [participant for participant in commit.participants if participant.is_proven]
-        if (
-            all(participant.is_decided for participant in commit.participants)
-            or backoff.is_over
-            or commit.run.interrupt.leaving
-        ):
-            break
-        _notify_unreachable(commit, proven)
-        backoff.pause()
+    prove_until(commit.participants, backoff, commit.pool)
+    proven = [participant for participant in commit.participants if participant.is_proven]
     lost = [each for each in commit.participants if each.name in commit.entries and each not in proven]
     why = entries_lost(lost, commit.entries) if lost else short_of_quorum(proven, needed, commit.success)
     if not why:
@@ -271,50 +263,14 @@ def _decide(commit: _MeshCommit, needed: Mapping[str, int]) -> dict[str, Outcome
     return _roll_back(commit, why)
 
 
-def _notify_unreachable(commit: _MeshCommit, proven: Sequence[Participant]) -> None:
-    """Where a cell keeps its channel and BSSID, a node that changed early still hears one that changes late, and may
-    create a station entry of the radio before its restart."""
-    names = {participant.name for participant in proven}
-
-    def notify_one(participant: Participant) -> None:
-        if participant.change is not None and participant.is_unreachable:
-            participant.change.listener.unreachable(names)
-
-    commit.each(commit.participants, notify_one)
-
-
-def _prove(participant: Participant) -> None:
-    """Observe a participant once. A connection that was opened after its services had reloaded is kept: another one
-    would prove nothing more."""
-    change = participant.change
-    if change is None:
-        return
-    was_reloaded = change.is_reloaded
-    connection = participant.take_proof() or connect(change)
-    participant.is_unreachable = connection is None
-    if connection is None:
-        return
-    try:
-        action = observe_and_decide(change, connection, is_opened_after_reload=was_reloaded)
-        participant.decide(action)
-        if change.last is not None:
-            participant.ctx.run.record(participant.name, change.last)
-        if was_reloaded and not participant.is_decided and connection.endpoint == change.new:
-            participant.proof = connection
-    except NodeError as error:
-        change.last_error = str(error)
-    finally:
-        if participant.proof is None:
-            connection.close()
-
-
 def _confirm_all(commit: _MeshCommit) -> dict[str, Outcome]:
     """Confirm the proven participants, and late ones until the window ends; the others roll back. One that has not
     answered its confirmation may have kept the change: it is asked again until its rollback would have ended, too."""
 
     def confirm_one(participant: Participant) -> None:
+        participant.await_look()
         if not participant.is_decided:
-            _prove(participant)
+            prove(participant)
         if participant.change is None or not participant.is_proven:
             return
         try:
@@ -329,7 +285,7 @@ def _confirm_all(commit: _MeshCommit) -> dict[str, Outcome]:
         return [p for p in commit.participants if p.awaits_confirm(is_window_over=backoff.elapsed_s > window_s)]
 
     while (left := unconfirmed()) and not backoff.is_over:
-        commit.each(left, confirm_one)
+        commit.each(sorted(left, key=lambda participant: not participant.is_proven), confirm_one)
         if commit.run.interrupt.leaving or not unconfirmed():
             break
         backoff.pause()
@@ -384,6 +340,7 @@ def _roll_back(commit: _MeshCommit, reason: str) -> dict[str, Outcome]:
     ended: dict[str, Outcome] = {}
 
     def poll_one(participant: Participant) -> None:
+        participant.await_look()
         if participant.change is not None:
             ended[participant.name] = poll(participant.change)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import Future
 from dataclasses import dataclass
 
 from meshctl.apply.change_in_progress import ChangeInProgress
@@ -45,6 +46,8 @@ class Participant:
     is_confirmed: bool = False
     # a connection that was opened after its services had reloaded, kept until the node has proven itself
     proof: SshConnection | None = None
+    # the look at it that is queued, or in progress
+    look: Future[None] | None = None
 
     @property
     def name(self) -> str:
@@ -62,6 +65,17 @@ class Participant:
     @property
     def leaves_cell(self) -> bool:
         return bool(self.ctx.plan.splits)
+
+    def await_look(self) -> None:
+        """Wait for the end of the look in progress. Raises what it raised."""
+        if self.look is not None:
+            self.look.result()
+            self.look = None
+
+    def cancel_look(self) -> None:
+        """Drop the look if it has not begun."""
+        if self.look is not None and self.look.cancel():
+            self.look = None
 
     def take_proof(self) -> SshConnection | None:
         """The kept connection, if it is still open."""
@@ -130,6 +144,9 @@ def unmet_of(participant: Participant) -> str:
     change = participant.change
     if change is None or participant.is_unreachable or not change.unmet:
         last_error = "" if change is None else change.last_error
+        if not (participant.is_unreachable or last_error):
+            # the first look at it is still in progress
+            return f"{participant.name}: it was not observed"
         return f"{participant.name}: it does not answer{f' ({last_error})' if last_error else ''}"
     return f"{participant.name}: {', '.join(change.unmet)}"
 
@@ -164,6 +181,8 @@ def unconfirmed_outcome(participant: Participant) -> Outcome:
         participant.name,
         Result.UNCERTAIN,
         f"left behind: the others are in the new cell, it rolls back to the old one ({unmet})",
-        hint="connect it by cable and run `meshctl resume`, or change the mesh back to the old cell",
+        # it does not answer the plan of the change back, which brings it into the mesh again
+        hint="connect it by cable and run `meshctl resume`, or change the mesh back to the old cell with "
+        f"`--leave-behind {participant.name}`",
         facts={LEFT_BEHIND: ", ".join(participant.ctx.plan.splits)},
     )

@@ -25,10 +25,14 @@ class Backoff:
         return time.monotonic() - self._began
 
     @property
+    def left_s(self) -> float:
+        return max(0.0, self.limit_s - self.elapsed_s)
+
+    @property
     def is_over(self) -> bool:
         return self.elapsed_s >= self.limit_s
 
     def pause(self) -> None:
         """Sleep for the current pause, or until the second Ctrl-C."""
-        self.interrupt.wait(min(self._pause_s, max(0.0, self.limit_s - self.elapsed_s)))
+        self.interrupt.wait(min(self._pause_s, self.left_s))
         self._pause_s = min(self._pause_s * GROWTH, MAX_PAUSE_S)

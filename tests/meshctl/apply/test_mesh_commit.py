@@ -25,8 +25,8 @@ from meshctl.apply.participant import (
     lead_s,
     quorum_of,
     short_of_quorum,
+    unconfirmed_outcome,
 )
-from meshctl.device.connection import Endpoint
 from meshctl.device.errors import NodeRefused
 from meshctl.device.observation import ChangeStatus, Observation
 from meshctl.device.openwrt import UptimeSample
@@ -290,43 +290,6 @@ class TestMoment:
         assert lead_s(participants[:1], 1) == 2.0
 
 
-def test_a_connection_that_was_opened_after_the_reload_is_kept_until_the_node_has_proven_itself(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    there = Endpoint("10.42.0.101")
-    change = SimpleNamespace(is_reloaded=False, last=None, last_error="", new=there)
-    base = Participant(
-        cast("NodeContext", SimpleNamespace(name="b01", plan=SimpleNamespace(splits=("main",)))),
-        change=cast("ChangeInProgress", change),
-    )
-    opened: list[SimpleNamespace] = []
-
-    def connect(_: object) -> SimpleNamespace:
-        connection = SimpleNamespace(endpoint=there, is_open=True, number=len(opened))
-        connection.close = lambda: setattr(connection, "is_open", False)
-        opened.append(connection)
-        return connection
-
-    actions = [Action.WAIT, Action.WAIT, Action.WAIT, Action.CONFIRM]
-    looks: list[tuple[int, bool]] = []
-
-    def look(_: object, connection: SimpleNamespace, *, is_opened_after_reload: bool) -> Action:
-        looks.append((connection.number, is_opened_after_reload))
-        change.is_reloaded = True
-        return actions[len(looks) - 1]
-
-    monkeypatch.setattr(mesh_commit, "connect", connect)
-    monkeypatch.setattr(mesh_commit, "observe_and_decide", look)
-    for number in range(4):
-        if number == 3:
-            # such as by a relay that restarts
-            opened[1].is_open = False
-        mesh_commit._prove(base)
-    assert looks == [(0, False), (1, True), (1, True), (2, True)]
-    assert base.is_proven
-    assert not any(connection.is_open for connection in opened)
-
-
 def test_an_entry_node_that_answers_but_fails_its_checks_is_not_said_to_be_away() -> None:
     """Seen on real OpenWrt: the base answered, and heard no neighbor."""
     heard, away = (
@@ -374,3 +337,12 @@ def test_an_entry_node_that_a_power_cut_has_rolled_back_is_not_said_to_have_fail
     base = Participant(cast("NodeContext", SimpleNamespace(name="base")), change=change, has_failed=True)
     assert entries_lost([base], ["base"]) == "the base rolled back"
     assert cause_of(base) == "base: its power was cut, or it rebooted, before it was confirmed"
+
+
+def test_the_way_back_of_a_node_that_was_left_behind_names_the_option_it_needs() -> None:
+    """Seen on real OpenWrt: the change back was refused, because it "would leave behind" the node in that very cell."""
+    change = cast("ChangeInProgress", SimpleNamespace(is_confirm_unanswered=False, unmet=()))
+    ctx = cast("NodeContext", SimpleNamespace(name="b03", plan=SimpleNamespace(splits=("radio0: channel 6 -> 11",))))
+    left = unconfirmed_outcome(Participant(ctx, change=change))
+    assert left.result is Result.UNCERTAIN
+    assert left.hint.endswith("change the mesh back to the old cell with `--leave-behind b03`")
