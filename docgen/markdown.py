@@ -122,6 +122,9 @@ def _type(field: Mapping[str, Any], definitions: Mapping[str, Any]) -> str:
             if isinstance(inner, Mapping):
                 return f"mapping to {_type(inner, definitions)}"
             return "{" + ", ".join(f"`{key}`" for key in field.get("properties", {})) + "}"
+        case [kind, *_]:
+            # the type, then those as which YAML reads it without quotes
+            return str(kind)
         case kind:
             return str(kind or "any value")
 

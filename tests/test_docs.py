@@ -177,6 +177,7 @@ def test_the_reference_describes_every_command(commands: dict[str, Command]) -> 
             assert f"## `{command.name}`" in text
             assert command.summary, command.name
     assert "| `confirm_window_s` |" in made["inventory-keys.md"]
+    assert "| `label` | string |" in made["inventory-keys.md"]
     assert "| `offline_s` | number | `10.0` |" in made["daemon-configuration.md"]
     assert "| `udp_mesh_peer_online` | gauge | `peer` |" in made["metrics.md"]
 

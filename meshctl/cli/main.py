@@ -139,6 +139,11 @@ class _RootGroup(TyperGroup):
             end = args.index("--") if "--" in args else len(args)
             moved = ["meshctl", *args[named:end], *args[:named], *args[end:]]
             raise InputError("options follow the command", hint=shlex.join(moved))
+        if "--install-completion" in args[:1]:
+            from meshctl.cli.completion_setup import checked_installation
+
+            with checked_installation():
+                return super().parse_args(ctx, args)
         return super().parse_args(ctx, args)
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:

@@ -50,14 +50,14 @@ def _real(value: object) -> object:
     raise expected_error("a number")
 
 
-def _flag(value: object) -> object:
+def any_flag(value: object) -> object:
     known = _FLAGS.get(value.lower()) if isinstance(value, Plain) else None
     if known is None:
         raise expected_error("true or false")
     return known
 
 
-def _text(value: object) -> str:
+def any_text(value: object) -> str:
     if not isinstance(value, str):
         raise expected_error("text")
     if "\0" in value:
@@ -125,20 +125,20 @@ def _device_path(value: str) -> str:
 
 def _address(value: object) -> IpAddress:
     try:
-        return without_zone(ip_address(_text(value)))
+        return without_zone(ip_address(any_text(value)))
     except ValueError:
         raise expected_error("an IP address such as 10.42.0.1 or fd42::1") from None
 
 
 def _ipv4_address(value: object) -> IPv4Address:
     try:
-        return IPv4Address(_text(value))
+        return IPv4Address(any_text(value))
     except AddressValueError:
         raise expected_error("an IPv4 address such as 10.42.0.1 (the legacy udp_mesh has no IPv6)") from None
 
 
 def _interface(value: object) -> IpInterface:
-    text = _text(value)
+    text = any_text(value)
     if "/" in text:
         try:
             return without_zone(ip_interface(text))
@@ -148,7 +148,7 @@ def _interface(value: object) -> IpInterface:
 
 
 def _network(value: object) -> IpNetwork:
-    text = _text(value)
+    text = any_text(value)
     if "/" not in text:
         raise expected_error("a network with its prefix length such as 10.42.0.0/24 or fd42::/64")
     try:
@@ -191,38 +191,38 @@ def empty_mapping(value: object) -> object:
 
 Whole = Annotated[int, BeforeValidator(_whole)]
 Real = Annotated[float, BeforeValidator(_real)]
-Flag = Annotated[bool, BeforeValidator(_flag)]
-Text = Annotated[str, BeforeValidator(_text)]
-Line = Annotated[str, BeforeValidator(_text), AfterValidator(_line)]
-Name = Annotated[str, BeforeValidator(_text), AfterValidator(_name)]
+Flag = Annotated[bool, BeforeValidator(any_flag)]
+Text = Annotated[str, BeforeValidator(any_text)]
+Line = Annotated[str, BeforeValidator(any_text), AfterValidator(_line)]
+Name = Annotated[str, BeforeValidator(any_text), AfterValidator(_name)]
 Mac = Annotated[
     str,
-    BeforeValidator(_text),
+    BeforeValidator(any_text),
     AfterValidator(_mac),
     WithJsonSchema({"type": "string", "pattern": f"^{_MAC.pattern}$"}),
 ]
 Country = Annotated[
     str,
-    BeforeValidator(_text),
+    BeforeValidator(any_text),
     AfterValidator(_country),
     WithJsonSchema({"type": "string", "pattern": "^[A-Z]{2}$"}),
 ]
-VlanId = Annotated[str, BeforeValidator(_text), AfterValidator(_vlan)]
+VlanId = Annotated[str, BeforeValidator(any_text), AfterValidator(_vlan)]
 SwitchPorts = Annotated[
     str,
-    BeforeValidator(_text),
+    BeforeValidator(any_text),
     AfterValidator(_switch_ports),
-    WithJsonSchema({"type": "string", "pattern": f"^{_SWITCH_PORTS}$"}),
+    WithJsonSchema({"type": ["string", "integer"], "pattern": f"^{_SWITCH_PORTS}$"}),
 ]
 Port = Annotated[
     str,
-    BeforeValidator(_text),
+    BeforeValidator(any_text),
     AfterValidator(_port),
     WithJsonSchema({"type": "string", "pattern": f"^{_PORT.pattern}$"}),
 ]
 DevicePath = Annotated[
     str,
-    BeforeValidator(_text),
+    BeforeValidator(any_text),
     AfterValidator(_device_path),
     WithJsonSchema({"type": "string", "pattern": "^/.+"}),
 ]

@@ -11,8 +11,10 @@ from pydantic.json_schema import GenerateJsonSchema, NoDefault
 from pydantic_core import core_schema
 
 from meshctl.inventory.documents import InventoryDocument
-from meshctl.inventory.fields import empty_mapping
+from meshctl.inventory.fields import any_flag, any_text, empty_mapping
 
+# of the words that the loader reads as true or false, those that are text in YAML 1.2
+_FLAG_WORDS = "^([Yy][Ee][Ss]|[Nn][Oo]|[Oo][Nn]|[Oo][Ff][Ff])$"
 SCHEMA_ID = "urn:meshctl:inventory:1"
 
 
@@ -45,10 +47,16 @@ class _Generator(GenerateJsonSchema):
         return NoDefault if default is None or isinstance(default, BaseModel) else default
 
     def function_before_schema(self, schema: core_schema.BeforeValidatorFunctionSchema) -> dict[str, Any]:
-        """Allow null where it means an empty mapping."""
+        """Allow null where it means an empty mapping, and what YAML 1.2, by which editors read, takes for another type
+        than the loader does: `label: 17`, `canary: yes`."""
         inner = super().function_before_schema(schema)
-        if schema["function"]["function"] is empty_mapping:
+        function = schema["function"]["function"]
+        if function is empty_mapping:
             return {"anyOf": [inner, {"type": "null"}]}
+        if function is any_text and inner["type"] == "string":
+            return {**inner, "type": ["string", "number", "boolean"]}
+        if function is any_flag:
+            return {**inner, "type": ["boolean", "string"], "pattern": _FLAG_WORDS}
         return inner
 
 

@@ -26,6 +26,7 @@ from meshctl.errors import InputError
 from meshctl.inventory.ranges import BadRange, expand
 from meshctl.model import Fleet, Node, NodeState, Robot
 from meshctl.suggest import did_you_mean
+from meshctl.wording import join_limited
 
 LIST_HINT = "run `meshctl inventory list` to list all nodes"
 COMPUTER = "computer"
@@ -37,6 +38,7 @@ _COMMA = re.compile(r",(?![^\[]*\])")  # none inside brackets
 _MAC = re.compile(r"(?:[0-9a-f]{2}:){5}[0-9a-f]{2}", re.IGNORECASE)
 # attributes printed on a device; compared regardless of case
 _PRINTED = ("label", "serial", "mac")
+_MAX_HINT_VALUES = 12
 
 Attributes = Mapping[str, Collection[str]]
 """Attributes that select a candidate, besides its name: attribute -> values."""
@@ -268,7 +270,7 @@ def _matching_attribute(term: Term, candidates: _Named[K], what: str) -> list[K]
         values = _values(term.attribute, candidates)
         raise InputError(
             f"no {what} has {term.attribute} {term.pattern!r}",
-            hint=did_you_mean(term.pattern, values) or f"found: {', '.join(values) or 'none'}",
+            hint=did_you_mean(term.pattern, values) or f"found: {join_limited(values, _MAX_HINT_VALUES) or 'none'}",
         )
     return found
 

@@ -155,7 +155,7 @@ def _fleet_alarms(snapshot: Snapshot) -> Iterable[Alarm]:
     for why, names in reasons.items():
         text = f"{join_limited(tuple(names))} not compared with the inventory: {why}"
         hint = "provide the missing secret, or fix the inventory (meshctl lint)"
-        yield Alarm(Level.WARNING, "not-compared", text, hint)
+        yield Alarm(Level.WARNING, "not-compared", text, hint, tuple(names))
     if snapshot.robots_skipped:
         yield Alarm(Level.NOTE, "robots-unasked", snapshot.robots_skipped)
 
@@ -170,14 +170,15 @@ def _former_alarms(found: Mapping[str, str]) -> Iterable[Alarm]:
     for mac, node in found.items():
         text = f"{mac} is in the mesh: the former device of {node}, which was replaced"
         hint = f"switch it off, or reset it to factory defaults: it has the address and the name of {node}"
-        yield Alarm(Level.WARNING, FORMER_DEVICE, text, hint)
+        yield Alarm(Level.WARNING, FORMER_DEVICE, text, hint, (node,))
 
 
 def _site_alarms(snapshot: Snapshot, now: float) -> Iterable[Alarm]:
     """One for each site that did not answer: how old the state is that is shown of it."""
     for site, why in sorted(snapshot.unusable_workers.items()):
         text = f"the nodes of site {site} were queried from here, not by its worker: {why.reason}"
-        yield Alarm(Level.NOTE, "site", text, why.hint)
+        there = tuple(node.name for node in snapshot.fleet.nodes.values() if node.site == site)
+        yield Alarm(Level.NOTE, "site", text, why.hint, there)
     silent: dict[str, list[str]] = {}
     for name, why in snapshot.no_answer.items():
         if why.of_gateway:
@@ -190,7 +191,8 @@ def _site_alarms(snapshot: Snapshot, now: float) -> Iterable[Alarm]:
             shown = f"nothing is known of {nodes}"
         else:
             shown = f"the last known state of {nodes} is {duration(max(0.0, now - last_s))} old"
-        yield Alarm(Level.WARNING, "site", f"no contact with site {site} ({why.reason}): {shown}", why.hint)
+        text = f"no contact with site {site} ({why.reason}): {shown}"
+        yield Alarm(Level.WARNING, "site", text, why.hint, tuple(names))
 
 
 def _refusals(snapshot: Snapshot) -> dict[str, tuple[Sighting, ...]]:

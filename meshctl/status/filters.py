@@ -14,7 +14,7 @@ from meshctl.errors import InputError
 from meshctl.inventory.selection import COMPUTER, LIST_HINT, attributes_of, robot_attributes, select, unmanaged_states
 from meshctl.model import Fleet, NodeState, Role
 from meshctl.status.alarm_codes import CODES
-from meshctl.status.values import Alarm, FleetStatus, Level
+from meshctl.status.values import Alarm, FleetStatus, Level, stranger_alarm
 from meshctl.suggest import did_you_mean
 from meshctl.wording import join_limited
 
@@ -58,12 +58,20 @@ class Filter:
         )
 
     def apply(self, status: FleetStatus) -> FleetStatus:
-        """The status of the selected devices. A filter drops the alarms of the whole fleet, except that selected robots
-        were not queried."""
+        """The status of the selected devices. Of the fleet's alarms, a selection keeps those about a selected node, and
+        that selected robots were not queried."""
         if self.is_empty:
             return status
-        kept = tuple(alarm for alarm in status.alarms if self.robots and alarm.code == "robots-unasked")
-        return replace(self.devices_of(status), alarms=kept, strangers=())
+        kept = tuple(alarm for alarm in status.alarms if self._concerns(alarm) and self._has_alarm((alarm,)))
+        strangers = status.strangers if self.nodes is None and self._has_alarm((stranger_alarm(status),)) else ()
+        return replace(self.devices_of(status), alarms=kept, strangers=strangers)
+
+    def _concerns(self, alarm: Alarm) -> bool:
+        if self.nodes is None:
+            return True
+        if alarm.code == "robots-unasked":
+            return bool(self.robots)
+        return not self.nodes.isdisjoint(alarm.nodes)
 
     def _has_alarm(self, alarms: Iterable[Alarm]) -> bool:
         if not self.alarms:

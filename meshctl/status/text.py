@@ -18,7 +18,7 @@ from meshctl.status.node_alarms import join_limited
 from meshctl.status.preflight import Check, verdict
 from meshctl.status.rows import row
 from meshctl.status.table import Paint, plain, table_lines
-from meshctl.status.values import Alarm, FleetStatus, Health, Level, NodeStatus, RobotStatus
+from meshctl.status.values import Alarm, FleetStatus, Health, Level, NodeStatus, RobotStatus, stranger_alarm
 from meshctl.wording import counted
 
 # More devices than this with the same alarm share one line.
@@ -100,23 +100,21 @@ def _all_alarms(status: FleetStatus) -> list[tuple[str, Alarm]]:
     """(device, alarm), most severe first; the device is empty for alarms of the fleet."""
     found = [("", alarm) for alarm in status.alarms]
     if status.strangers:
-        count = len(status.strangers)
-        text = f"{join_limited(status.strangers)} {'are' if count > 1 else 'is'} in the mesh but not in the inventory"
-        found.append(("", Alarm(Level.WARNING, "stranger", text, "if it is yours, add its `mac:` to the inventory")))
+        found.append(("", stranger_alarm(status)))
     for device in status:
         found += [(device.title, alarm) for alarm in device.alarms]
     return sorted(found, key=lambda pair: -pair[1].level)
 
 
 def _alarm_lines(status: FleetStatus, width: int | None, paint: Paint, brief: bool) -> Iterator[str]:
-    groups: dict[tuple[Level, str], list[tuple[str, Alarm]]] = {}
+    groups: dict[tuple[Level, str, bool], list[tuple[str, Alarm]]] = {}
     for name, alarm in _all_alarms(status):
-        groups.setdefault((alarm.level, alarm.code), []).append((name, alarm))
-    for (level, code), members in groups.items():
+        groups.setdefault((alarm.level, alarm.code, bool(name)), []).append((name, alarm))
+    for (level, code, is_of_device), members in groups.items():
         if brief and level is Level.NOTE:
             continue
         lead = level.text.upper().ljust(7)
-        if len(members) > MAX_SINGLE_ALARMS:
+        if is_of_device and len(members) > MAX_SINGLE_ALARMS:
             names = join_limited(tuple(name for name, _ in members))
             text = f"{code} on {len(members)}: {names} (details: --alarm {code})"
             yield from _wrapped(lead, text, width, paint, level.text)

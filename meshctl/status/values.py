@@ -12,6 +12,9 @@ from meshctl.inventory.selection import COMPUTER
 from meshctl.model import Node, NodeState, Robot
 from meshctl.robots.facts import RobotFacts
 from meshctl.topology import Sighting
+from meshctl.wording import join_limited
+
+_MAX_STRANGERS = 6
 
 
 class Level(IntEnum):
@@ -41,12 +44,14 @@ class Health(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Alarm:
-    """`code` is stable, for filters; `text` says what is wrong, `hint` what to do."""
+    """`code` is stable, for filters; `text` says what is wrong, `hint` what to do. `nodes`: those that an alarm of the
+    fleet is about; none if it is about the fleet as a whole."""
 
     level: Level
     code: str
     text: str
     hint: str = ""
+    nodes: tuple[str, ...] = ()
 
 
 def health_of(alarms: Iterable[Alarm]) -> Health:
@@ -266,3 +271,10 @@ class FleetStatus:
             return ExitCode.UNREACHABLE
         is_fleet_degraded = any(alarm.level > Level.NOTE for alarm in self.alarms)
         return ExitCode.FINDINGS if self.count(Health.DEGRADED) or self.strangers or is_fleet_degraded else ExitCode.OK
+
+
+def stranger_alarm(status: FleetStatus) -> Alarm:
+    """The alarm of the strangers in the mesh."""
+    are = "are" if len(status.strangers) > 1 else "is"
+    text = f"{join_limited(status.strangers, _MAX_STRANGERS)} {are} in the mesh but not in the inventory"
+    return Alarm(Level.WARNING, "stranger", text, "if it is yours, add its `mac:` to the inventory")

@@ -16,9 +16,10 @@ visit of a client, must not go through all of them.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 from collections import Counter, deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 
 from udp_mesh.core.events import MessageReceived, Receipt
@@ -30,6 +31,7 @@ log = logging.getLogger(__name__)
 
 RETRY_S = 5.0
 """Until a message that neither the disk nor a program took is requested from its sender again."""
+CONFIRM_AT_END_S = 5.0
 
 LoggedItem = tuple[str, str, int]
 """(source, topic, number) of an item of a log."""
@@ -135,6 +137,24 @@ class Inbox:
                 held.receipt = None
             elif not held.reading:
                 self._drop(key, held)
+
+    async def confirm_stored(self) -> None:
+        """Before the end: wait until what is held is on disk, and confirm it; its sender would send it again. A second
+        time for what came meanwhile. A disk that hangs does not hold up the goodbye."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(CONFIRM_AT_END_S):
+                for _ in range(2):
+                    keys = list(self._held)
+                    await asyncio.wrap_future(self._store.flush())
+                    self._confirm_those_on_disk(keys)
+
+    def _confirm_those_on_disk(self, keys: Iterable[int]) -> None:
+        for key in keys:
+            held = self._held.get(key)
+            if held is not None and held.receipt is not None and held.item is None and self._store.holds(key):
+                held.on_disk = True
+                self._confirm(held.receipt)
+                held.receipt = None
 
     def _drop(self, key: int, held: _Held) -> None:
         self._release(key)

@@ -123,6 +123,7 @@ class Service:
         for task in list(self._tasks):
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
+        await self.inbox.confirm_stored()
         self.driver.close()
         self.thin_ports.close()
         await self._legacy.save(self.driver.node.legacy_positions())

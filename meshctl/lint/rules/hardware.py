@@ -14,7 +14,7 @@ from meshctl.lint.rule import Example, Finding, fleet_rule
 from meshctl.lint.rules.encryption import packages_path
 from meshctl.lint.rules.firmware import ROCKET_IMAGE
 from meshctl.lint.rules.references import suggest
-from meshctl.model import Fleet, Release
+from meshctl.model import Fleet, HardwareProfile, Release
 from meshctl.resolve import package_files, package_needs
 from meshctl.suggest import nearest, suggestion
 from meshctl.wording import one_of
@@ -191,26 +191,26 @@ def release_unmaintained(fleet: Fleet, _context: LintContext) -> Iterator[Findin
     "MC828",
     Severity.WARNING,
     "The device is too small for the release",
-    why="""Releases from 22.03 on run out of memory with 32 MiB, and do not fit into 4 MiB of flash with the mesh's
-    packages: such nodes reboot under load.""",
-    fix="Use other hardware, or an older release for these devices.",
+    why="""Releases from 22.03 on run out of memory with 32 MiB: such nodes reboot under load. In 4 MiB of flash, an
+    image of any release leaves no room for the mesh's packages, unless it is built without what the node does not
+    need.""",
+    fix="""Use other hardware. For 32 MiB of memory, an older release works, too. For 4 MiB of flash, build a smaller
+    image and name it in `firmware`: its size is compared with the flash.""",
     failing="hardware: {rocket: {memory_mib: 32}}",
     passing="hardware: {rocket: {memory_mib: 64}}",
 )
 def device_too_small(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     for profile in fleet.hardware.values():
-        if profile.release < Release.V22_03:
-            continue
-        sizes = (
-            ("memory_mib", profile.memory_mib, _MIN_MEMORY_MIB),
-            ("flash_mib", profile.flash_mib, _MIN_FLASH_MIB),
-        )
-        for key, size, least in sizes:
-            # MC810 checks the size of an existing image
-            image = firmware.image_path(profile) if key == "flash_mib" else None
-            if size < least and (image is None or context.files.size_bytes(image) is None):
-                path = ("hardware", profile.name, key)
-                yield Finding(path, f"too small for {profile.release}", f"at least {least}", str(size))
+        if profile.release >= Release.V22_03 and profile.memory_mib < _MIN_MEMORY_MIB:
+            yield _too_small(profile, "memory_mib", _MIN_MEMORY_MIB, profile.memory_mib)
+        # MC810 checks the size of an existing image
+        image = firmware.image_path(profile)
+        if profile.flash_mib < _MIN_FLASH_MIB and (image is None or context.files.size_bytes(image) is None):
+            yield _too_small(profile, "flash_mib", _MIN_FLASH_MIB, profile.flash_mib)
+
+
+def _too_small(profile: HardwareProfile, key: str, least: int, size: int) -> Finding:
+    return Finding(("hardware", profile.name, key), f"too small for {profile.release}", f"at least {least}", str(size))
 
 
 @fleet_rule(

@@ -100,4 +100,11 @@ def test_unquoted_values_accepted_by_the_loader_are_accepted_by_the_schema(valid
     document = _example()
     document["hardware"]["rocket"]["release"] = 24.10
     document["nodes"]["spare"] = None
+    document["nodes"]["base"].update({"label": 17, "serial": 20261201, "groups": [2026]})
+    document["meshes"]["main"]["ssid"] = 4711
+    document["hardware"]["sector"]["switch_vlans"] = {"1": 3}
+    # text in YAML 1.2, by which editors read
+    document["apply"]["canary"] = "yes"
     assert list(validator.iter_errors(document)) == []
+    document["apply"]["canary"] = "maybe"
+    assert list(validator.iter_errors(document)) != []

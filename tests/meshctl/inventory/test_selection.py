@@ -176,3 +176,11 @@ def test_the_beginning_of_several_names_suggests_a_pattern_and_not_one_of_them()
     with pytest.raises(InputError, match="no managed node of lab matches 'b0'") as caught:
         chosen("b0")
     assert caught.value.hint == "2 names begin with it: 'b0*' selects them"
+
+
+def test_the_values_in_a_hint_are_limited() -> None:
+    labels: dict[str, Attributes] = {f"h{number}": {"label": [f"House {number}"]} for number in range(1, 401)}
+    with pytest.raises(InputError) as raised:
+        select(["label:nothing"], labels, read, what="node")
+    assert raised.value.hint.startswith("found: House 1, House 2, ")
+    assert raised.value.hint.endswith(", House 12 and 388 more")

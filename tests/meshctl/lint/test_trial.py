@@ -364,6 +364,12 @@ def test_too_small_flash_is_reported_even_without_the_image(tmp_path: Path) -> N
     assert sorted(_codes(f"hardware: {{rocket: {{flash_mib: 4, firmware: {image}}}}}", tmp_path)) == ["MC801", "MC828"]
 
 
+@pytest.mark.parametrize(("sizes", "codes"), [("flash_mib: 4", ["MC828"]), ("memory_mib: 32", [])])
+def test_flash_of_4_mib_is_too_small_for_every_release(sizes: str, codes: list[str], tmp_path: Path) -> None:
+    fragment = f'hardware: {{rocket: {{release: "19.07", {sizes}}}}}'
+    assert [code for code in _codes(fragment, tmp_path) if code == "MC828"] == codes
+
+
 @pytest.mark.parametrize("target", ["newchip9000/generic", "ramips/en7581"])
 def test_an_unknown_target_unlike_any_known_one_is_accepted(target: str, tmp_path: Path) -> None:
     assert _codes(f"hardware: {{rocket: {{target: {target}}}}}", tmp_path) == []

@@ -26,7 +26,7 @@ from meshctl.status.preflight import Check
 from meshctl.status.rows import COLUMNS, TableCell
 from meshctl.status.table import layout, table_lines
 from meshctl.status.text import preflight_text, summary_lines, text, topic_lines
-from meshctl.status.values import NoAnswer
+from meshctl.status.values import Alarm, Level, NoAnswer
 from tests.meshctl.status.fleets import HEALTHY, NOW, TEAM, look_of, status_of
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -242,6 +242,24 @@ def test_selected_robots_that_were_not_queried_are_mentioned(fleet: Fleet) -> No
         for word in ("role:computer", "role:beacon")
     }
     assert kept == {"role:computer": ["robots-unasked"], "role:beacon": []}
+
+
+def test_strangers_are_shown_without_a_selection_of_devices(fleet: Fleet) -> None:
+    status = replace(status_of(fleet), strangers=("02:00:00:00:00:99",))
+    kept = {
+        " ".join((*words, *alarms)): select_devices(fleet, words, Path.read_text, alarms=alarms).apply(status).strangers  # type: ignore[arg-type]
+        for words, alarms in (([], ["stranger"]), ([], ["any"]), ([], ["error"]), (["b01"], []), (["b01"], ["any"]))
+    }
+    assert [word for word, strangers in kept.items() if strangers] == ["stranger", "any"]
+
+
+def test_alarms_of_many_sites_are_lines_of_their_own(fleet: Fleet) -> None:
+    """Four of them were `site on 4: , , , `."""
+    alarms = tuple(Alarm(Level.WARNING, "site", f"no contact with site {name}", "", (name,)) for name in "abcde")
+    printed = text(replace(status_of(fleet), alarms=alarms), None)
+    assert [line for line in printed.splitlines() if "no contact" in line] == [
+        f"WARNING no contact with site {name}" for name in "abcde"
+    ]
 
 
 def test_the_alarms_that_exist_are_counted(fleet: Fleet) -> None:

@@ -24,6 +24,7 @@ from meshctl.sites.protocol import WorkerError
 from meshctl.sites.uplink import Uplink
 from meshctl.status.assess import Snapshot, assess
 from meshctl.status.collect import Collector
+from meshctl.status.filters import select_devices
 from meshctl.status.site_observer import MAX_OUTPUT_BYTES, PERIOD_S, SiteObserver, answers_json, parse_answers
 from meshctl.status.values import Level, NoAnswer
 from meshctl.topology import Graph
@@ -202,11 +203,24 @@ def test_the_alarm_of_a_silent_site_says_how_old_its_facts_are(workers: Workers)
     snapshot = Snapshot(
         fleet, {}, dict.fromkeys(("n1", "n2"), why), {}, {}, Graph(), known, {}, unusable_workers={"south": why}
     )
-    found = {alarm.level: alarm for alarm in assess(snapshot, fleet.nodes.values(), 1090.0).alarms}
+    assessed = assess(snapshot, fleet.nodes.values(), 1090.0)
+    found = {alarm.level: alarm for alarm in assessed.alarms}
     assert found[Level.WARNING].text == (
         "no contact with site north (site north is not connected to the NATS hub): the last known state of its "
         "2 nodes is 90 s old"
     )
     assert found[Level.NOTE].text.startswith("the nodes of site south were queried from here, not by its worker")
+    shown = {
+        " ".join(words or alarms): [alarm.level.text for alarm in chosen.apply(assessed).alarms]
+        for words, alarms in ((["site:north"], []), (["n1"], []), (["site:south"], []), ([], ["site"]), ([], ["drift"]))
+        for chosen in [select_devices(fleet, words, Path.read_text, alarms=alarms)]  # type: ignore[arg-type]
+    }
+    assert shown == {
+        "site:north": ["warning"],
+        "n1": ["warning"],
+        "site:south": ["note"],
+        "site": ["note", "warning"],
+        "drift": [],
+    }
     nothing = assess(replace(snapshot, known={}), fleet.nodes.values(), 1090.0).alarms
     assert any("nothing is known of its 2 nodes" in alarm.text for alarm in nothing)

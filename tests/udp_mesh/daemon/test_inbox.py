@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
+from tests.udp_mesh.daemon.disks import standing_disk
 from tests.udp_mesh.daemon.processes import (
     RunningDaemon,
     collect,
@@ -118,3 +120,22 @@ def test_a_message_neither_stored_nor_read_is_not_delivered_until_resent() -> No
             program.subscribe("kept")
             assert len(collect(program, 1)[0].payload) == 500
             assert set(outcomes(sender, 1).values()) == {"delivered"}
+
+
+def test_a_daemon_that_is_stopped_confirms_what_it_has_received() -> None:
+    """Otherwise its senders send that again when it is back, and its programs get it twice."""
+    with (
+        two_daemons(KEPT) as (alice, bob),
+        standing_disk(bob.folder / "bob" / "inbox", 0) as go_on,
+        alice.client() as sender,
+        ThreadPoolExecutor(1) as stopping,
+    ):
+        # The disk hangs at the first message, whose file is a pipe and cannot be synchronized; the second one waits.
+        _, number = (sender.publish("kept", payload, to="bob", notify=True) for payload in (b"hangs", b"waits"))
+        with bob.client() as program:
+            poll(lambda: program.request("status")["inbox_messages"] == 2, "the messages at bob")
+        code = stopping.submit(bob.stop)
+        poll(lambda: not bob.socket.exists(), "the end of bob's socket")
+        go_on()
+        assert outcomes(sender, 1) == {number: "delivered"}
+        assert code.result() == 0
