@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import difflib
 import itertools
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -19,6 +20,8 @@ MAX_SEED = 1_000_000_000
 Settings = tuple[tuple[str, str], ...]
 """(path into the scenario, value as YAML), sorted by path."""
 
+_SIMILAR = 0.8
+"""`los` is as similar to `loss`."""
 _RANGE = re.compile(r"(\d{1,10})(?:-(\d{1,10}))?", re.ASCII)
 
 
@@ -64,6 +67,9 @@ def parse_parameters(words: Iterable[str], short: Mapping[str, str]) -> tuple[Pa
         elif len(set(values)) != len(values):
             twice = next(value for value in values if values.count(value) > 1)
             problems.append(f"--set {word}: expected each value once, found {twice!r} twice")
+        elif near := difflib.get_close_matches(path, short, n=1, cutoff=_SIMILAR):
+            # no scenario has a key so similar to one of these, and its own keys would be suggested otherwise
+            problems.append(f"--set {word}: expected a path or a short name, found {path!r}; did you mean {near[0]!r}?")
         elif path == "seed":
             problems.append(f"--set {word}: expected no seeds here; use --seeds")
         elif path in found:

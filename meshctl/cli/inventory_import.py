@@ -17,7 +17,7 @@ from meshctl.cli.new_nodes_file import NewNodesFile, file_of_new_nodes
 from meshctl.cli.output import echo, echo_json
 from meshctl.diagnostics import InvalidInput
 from meshctl.errors import InputError
-from meshctl.inventory.csv_table import COLUMNS, NodeEdit, Row, checked, edits, read
+from meshctl.inventory.csv_table import COLUMNS, NodeEdit, Row, at_row, checked, edits, read
 from meshctl.inventory.edit import Editor, FileEdit, save
 from meshctl.inventory.load import load_fleet
 from meshctl.model import Fleet
@@ -145,6 +145,9 @@ def _changes(editor: Editor, found: tuple[NodeEdit, ...], file: str) -> tuple[Fi
     try:
         return editor.changes()
     except InvalidInput as reason:
+        of_rows = [at_row(diagnostic, found, file) for diagnostic in reason.diagnostics]
+        if None not in of_rows:
+            raise InvalidInput(filter(None, of_rows)) from reason
         raise InputError(f"{file}: the inventory would have errors, so nothing was written:\n{reason}") from reason
 
 

@@ -12,7 +12,7 @@ import io
 import re
 import unicodedata
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from pydantic import TypeAdapter, ValidationError
 
@@ -183,6 +183,15 @@ def edits(rows: Iterable[Row], fleet: Fleet, file: str, *, add: bool = False) ->
     if errors:
         raise InvalidInput(errors[: codes.MAX_DIAGNOSTICS])
     return tuple(found)
+
+
+def at_row(diagnostic: Diagnostic, found: Iterable[NodeEdit], file: str) -> Diagnostic | None:
+    """An error of the edited inventory, such as an unknown group, at the row that set the value; None if none did."""
+    for edit in found:
+        for column in edit.values:
+            if diagnostic.path == f"nodes.{edit.node}.{column}":
+                return replace(diagnostic, position=Position(file, edit.line), path=column)
+    return None
 
 
 def _has(node: Node, column: str, value: str) -> bool:

@@ -35,6 +35,9 @@ class YamlEntry:
     def is_list(self) -> bool:
         return isinstance(self.tree, SequenceNode)
 
+    def has(self, key: str) -> bool:
+        return isinstance(self.tree, MappingNode) and key in self.tree.values
+
     def problem(self, expected: str, found: str = "") -> None:
         """Add the problem that this entry is not `expected`."""
         place = Position("") if self._where is None else position(self._where)

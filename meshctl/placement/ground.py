@@ -70,6 +70,9 @@ def parse(text: str, file: str) -> Ground:
 
 
 def _ground(root: YamlEntry) -> Ground:
+    if root.has("meshctl"):
+        root.problem("a map: a file with nodes, walls or air", "an inventory")
+        root.finish()
     ground = ground_in(root.mapping((*GROUND_KEYS, "links")))
     if not root.is_present:
         root.problem("a mapping")

@@ -35,11 +35,12 @@ def test_a_short_name_stands_for_its_path() -> None:
         (["a=1,1"], "--set a=1,1: expected each value once, found '1' twice"),
         (["seed=1"], "--set seed=1: expected no seeds here; use --seeds"),
         (["a=1", "a=2"], "--set a=2: expected each path once, found a in two options"),
+        (["los=0"], "--set los=0: expected a path or a short name, found 'los'; did you mean 'loss'?"),
     ],
 )
 def test_a_wrong_parameter_is_reported(words: list[str], problem: str) -> None:
     with pytest.raises(SweepError) as raised:
-        parse_parameters(words, {})
+        parse_parameters(words, {"loss": "air.least_loss"})
     assert str(raised.value) == problem
 
 

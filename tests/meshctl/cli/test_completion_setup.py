@@ -13,7 +13,7 @@ RC = b"# mine\n" * 1000
 
 
 def install(home: Path, limit: str = "unlimited") -> subprocess.CompletedProcess[str]:
-    """`limit` is the maximum size of a file, in KiB: like a full disk, a write beyond it is cut short."""
+    """`limit` is the maximum size of a file, in KiB: like a full disk, a write fails in the middle."""
     environment = {"PATH": os.environ["PATH"], "HOME": str(home), "_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION": "1"}
     command = [sys.executable, "-m", "meshctl", "--install-completion", "bash"]
     return subprocess.run(

@@ -294,3 +294,11 @@ def test_an_occupancy_map_is_drawn_below_its_plan(tmp_path: Path) -> None:
     # the page, the rock in runs, the base
     assert svg(view, planned).count("<rect") == 1 + 10 + 1
     assert png(view, planned).startswith(b"\x89PNG")
+
+
+def test_an_inventory_in_place_of_a_map_is_one_error() -> None:
+    inventory = GROUND.parents[1] / "community" / "fleet.yaml"
+    with pytest.raises(InvalidInput) as raised:
+        ground.load(inventory)
+    (found,) = raised.value.diagnostics
+    assert found.text == "expected a map: a file with nodes, walls or air, found an inventory"
