@@ -25,7 +25,6 @@ from meshctl.fleet.journal import ROBOT_PREFIX, Journal
 from meshctl.model import Fleet, Node
 from meshctl.nodes.collect import facts_of, fleet_graph, known_macs, reports_of
 from meshctl.nodes.connections import ConnectionPool
-from meshctl.nodes.dead_changes import is_left_by_dead
 from meshctl.nodes.desired import Renderer
 from meshctl.nodes.site_gateways import PIN_PREFIX
 from meshctl.plan import DesiredState, NodePlan, node_plan
@@ -277,15 +276,11 @@ class Collector:
                 unrendered[node.name] = desired
             elif observation is not None:
                 exact = self.renderer.desired(node, observation)
-                plans[node.name] = node_plan(exact, observation, fingerprints, owner=self._owner_for(observation))
+                change = observation.change
+                # locks and changes of others have alarms of their own, and a run that makes them is no error
+                owner = "" if change is None else change.lock_owner or change.owner
+                plans[node.name] = node_plan(exact, observation, fingerprints, owner=owner or self.owner)
         return plans, unrendered
-
-    def _owner_for(self, observation: Observation) -> str:
-        """Whose locks and changes are no obstacle: ours, and those of a killed process, which the next change ends."""
-        change = observation.change
-        if change is None or not is_left_by_dead(observation):
-            return self.owner
-        return change.lock_owner or change.owner
 
     def _collect_robot(self, robot: str) -> RobotFacts:
         expected = self._expected_release(robot)

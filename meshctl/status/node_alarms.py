@@ -40,6 +40,8 @@ CLOCK_TOLERANCE_S = 3600.0
 # how iw names the modes that a mesh runs in
 MESH_MODES = ("ibss", "mesh point")
 MAX_NAMES = 6
+# of a change, while its services reload or may do so
+_RELOADING_STATES = ("waiting", "applied", "restoring")
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,6 +69,12 @@ class NodeAlarmInput:
         """Whether it should be in its mesh now: deployed, and not the only deployed node."""
         others = (n for mesh in self.node.meshes for n in self.fleet.members(mesh) if n.name != self.node.name)
         return self.node.state is NodeState.DEPLOYED and any(n.state is NodeState.DEPLOYED for n in others)
+
+    @property
+    def is_reloading(self) -> bool:
+        """Whether its services, and with them its radios, may just be restarting: it has the alarm `change`."""
+        change = self.observation.change
+        return change is not None and (change.state in _RELOADING_STATES or change.is_reloading_restored)
 
 
 def alarms(facts: NodeAlarmInput) -> tuple[Alarm, ...]:
@@ -103,12 +111,16 @@ def _drift(facts: NodeAlarmInput) -> Iterator[Alarm]:
 
 def _left_over(facts: NodeAlarmInput) -> Iterator[Alarm]:
     """A mesh that it has left may still be joined through it, and others may be disturbed on its channel."""
+    if facts.is_reloading:
+        return
     for name in left_over(facts.observation):
         text = f"{name} is on the air, although its configuration has turned it off"
         yield Alarm(Level.WARNING, "left-over", text, f"meshctl provision {facts.node.name} takes it down")
 
 
 def _radios(facts: NodeAlarmInput) -> Iterator[Alarm]:
+    if facts.is_reloading:
+        return
     mesh_radios = {radio.name for radio in facts.node.radios if radio.mesh is not None}
     for radio in facts.observation.radios or ():
         if radio.name in mesh_radios and (not radio.up or radio.setup_failed):
@@ -129,6 +141,8 @@ def _radios(facts: NodeAlarmInput) -> Iterator[Alarm]:
 
 
 def _mesh(facts: NodeAlarmInput) -> Iterator[Alarm]:
+    if facts.is_reloading:
+        return
     if facts.must_mesh and not facts.neighbors:
         yield Alarm(
             Level.ERROR,

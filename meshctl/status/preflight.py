@@ -144,21 +144,24 @@ def _alarm_check(
     *codes: str,
     answered: Callable[[FleetStatus], _Answers] = _answered_radios,
     is_fleetwide: bool = False,
+    with_notes: bool = False,
 ) -> Callable[[Fleet, FleetStatus], Check]:
-    """A check that no device has one of these alarms; `answered` counts those that can report them."""
+    """A check that no device has one of these alarms, notes only if asked for; `answered` counts the devices that can
+    report them."""
+    least = Level.NOTE if with_notes else Level.WARNING
 
     def check(fleet: Fleet, status: FleetStatus) -> Check:
         devices: Sequence[NodeStatus | RobotStatus] = status.nodes if answered is _answered_radios else status.robots
-        bad = [_alarm_text(device.name, device.alarms, codes) for device in devices]
+        bad = [_alarm_text(device.name, device.alarms, codes, least) for device in devices]
         everywhere = [alarm.text for alarm in status.alarms if is_fleetwide and alarm.code in codes]
         return _check(name, [*everywhere, *(text for text in bad if text)], good, answered(status))
 
     return check
 
 
-def _alarm_text(name: str, alarms: Iterable[Alarm], codes: Iterable[str]) -> str:
-    """The texts of these alarms; notes do not block."""
-    found = ", ".join(alarm.text for alarm in alarms if alarm.code in codes and alarm.level > Level.NOTE)
+def _alarm_text(name: str, alarms: Iterable[Alarm], codes: Iterable[str], least: Level = Level.WARNING) -> str:
+    """The texts of these alarms; notes do not block by default."""
+    found = ", ".join(alarm.text for alarm in alarms if alarm.code in codes and alarm.level >= least)
     return f"{name}: {found}" if found else ""
 
 
@@ -234,7 +237,7 @@ _CHECKS: Sequence[Callable[[Fleet, FleetStatus], Check]] = (
     _alarm_check(
         "configuration", "matches the inventory", "drift", "foreign", "refused", "not-compared", is_fleetwide=True
     ),
-    _alarm_check("changes", "no change in progress", "change"),
+    _alarm_check("changes", "no change in progress", "change", "locked", with_notes=True),
     _alarm_check("radios", "every radio is in its cell", "radio", "join", "left-over", "channel", "alone", "bridge"),
     _quality,
     _alarm_check("resources", "enough memory and flash", "memory", "flash"),

@@ -104,7 +104,9 @@ def test_an_unknown_group_in_a_table_is_not_written(inventory: Path) -> None:
     before = (inventory / "fleet.yaml").read_bytes()
     done = run(inventory, "node,groups\nhusky1-b01,beacons\nbase,beacon\n")
     assert done.exit_code == 2
-    assert "error: standard input:3: groups: unknown group 'beacon' [INV032]\n  = did you mean 'beacons'?" in done.stderr
+    assert (
+        "error: standard input:3: groups: unknown group 'beacon' [INV032]\n  = did you mean 'beacons'?" in done.stderr
+    )
     assert (inventory / "fleet.yaml").read_bytes() == before
 
 

@@ -186,6 +186,41 @@ def test_the_owner_of_a_change_is_named_as_a_person_reads_it(fleet: Fleet) -> No
     assert alarms(status, "rover")["change"].text == "a change by ada@base (process 17) is applied, 40 s left"
 
 
+@pytest.mark.parametrize(
+    "change",
+    [
+        ChangeStatus("waiting", owner="bob"),
+        ChangeStatus("applied", owner="bob", left_s=40.0),
+        ChangeStatus("restoring", owner="bob"),
+        ChangeStatus("idle", is_reloading_restored=True),
+    ],
+)
+def test_a_radio_that_restarts_in_a_change_is_no_alarm(fleet: Fleet, change: ChangeStatus) -> None:
+    """A monitor called each run of provision an error of every node that it changed."""
+    off: dict[str, Any] = {
+        "radios": (RadioState("radio0", False, True, False, False, {}, ()),),
+        "links": (WirelessLink("mesh0", "IBSS", MACS["rover"], channel=11, joined=False),),
+        "neighbors": (),
+        "originators": (),
+        "stations": (),
+    }
+    rover = seen("rover", {"b01": 200}, change=change, **off)
+    assert set(alarms(status_of(fleet, {**HEALTHY, "rover": rover}), "rover")) == {"change"}
+    # one that is not being changed, or whose change has not started
+    for other in (ChangeStatus("idle"), ChangeStatus("armed", owner="bob")):
+        rover = seen("rover", {"b01": 200}, change=other, **off)
+        found = set(alarms(status_of(fleet, {**HEALTHY, "rover": rover}), "rover"))
+        assert {"radio", "join", "channel", "alone"} <= found
+
+
+def test_a_node_that_another_operator_is_changing_is_a_no_go_and_no_error(fleet: Fleet) -> None:
+    change = ChangeStatus("idle", lock_owner="bob@laptop:17:4711", lock_left_s=40.0)
+    status = status_of(fleet, {**HEALTHY, "rover": seen("rover", {"b01": 200}, change=change)})
+    assert health(status)["rover"] is Health.OK
+    (changes,) = (check for check in preflight(fleet, status) if check.name == "changes")
+    assert (changes.is_go, changes.reason) == (False, "rover: locked by bob@laptop (process 17)")
+
+
 def test_a_radio_that_is_off_but_on_the_air_is_an_alarm_and_a_no_go(fleet: Fleet) -> None:
     """25.12 leaves it in its cell, and versions before this one did not take it down."""
     wireless = """
