@@ -1,14 +1,17 @@
-"""Fleet and text -> findings: run the rules, add positions, merge findings that nodes share."""
+"""Fleet and text -> findings: run the rules, repeat those of a rendered node for the nodes alike, add positions, merge
+findings that nodes share."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Hashable, Iterable, Iterator, Mapping
 from dataclasses import replace
 
 from meshctl.diagnostics import Diagnostic, Position, sorted_diagnostics
 from meshctl.lint.catalog import RULES
 from meshctl.lint.context import LintContext
+from meshctl.lint.grouping import group_by_key
 from meshctl.lint.rule import Finding, Rule
+from meshctl.lint.trial_rendering import kind_of
 from meshctl.model import Fleet, MissingOrigin
 from meshctl.wording import join_limited
 
@@ -17,16 +20,41 @@ def lint(fleet: Fleet, context: LintContext, rules: Iterable[Rule] = RULES) -> t
     """Findings of the fleet rules, sorted by position. Linear in the size of the fleet."""
     found: list[Diagnostic] = []
     reported: set[Position] = set()
+    alike = _Alike(fleet)
     # fallback rules run last: they skip positions that other rules report
     for rule in sorted(rules, key=lambda rule: rule.is_fallback):
         if rule.check is None:
             continue
-        items = [diagnostic(rule, finding, _position(fleet, finding)) for finding in rule.check(fleet, context)]
+        items = [
+            diagnostic(rule, finding, _position(fleet, finding))
+            for one in rule.check(fleet, context)
+            for finding in (alike.all_of(one) if rule.is_per_kind else (one,))
+        ]
         if rule.is_fallback:
             items = [item for item in items if item.position not in reported]
         found.extend(items)
         reported.update(item.position for item in items)
     return sorted_diagnostics(_merged(found))
+
+
+class _Alike:
+    """The nodes of each kind: a finding in the `extra_uci` of one, perhaps at a line of its own in each of them."""
+
+    def __init__(self, fleet: Fleet) -> None:
+        self._fleet = fleet
+        self._names: dict[Hashable, list[str]] | None = None
+
+    def all_of(self, finding: Finding) -> Iterator[Finding]:
+        """The finding, and the same for every node of the same kind."""
+        yield finding
+        if finding.position is not None or len(finding.path) < 3 or finding.path[2] != "extra_uci":
+            return
+        if self._names is None:
+            self._names = group_by_key((kind_of(node), node.name) for node in self._fleet.managed())
+        name = finding.path[1]
+        for other in self._names.get(kind_of(self._fleet.nodes[name]), ()) if name in self._fleet.nodes else ():
+            if other != name:
+                yield replace(finding, path=("nodes", other, *finding.path[2:]))
 
 
 def lint_texts(sources: Mapping[str, str], rules: Iterable[Rule] = RULES) -> tuple[Diagnostic, ...]:

@@ -51,7 +51,9 @@ class Example:
 @dataclass(frozen=True, slots=True)
 class Rule:
     """`why` says what goes wrong in the field, `fix` what to do. Exactly one check is set, or none for findings of the
-    engine itself (suppressions, the baseline). A fallback rule is silent where another rule reports."""
+    engine itself (suppressions, the baseline). A fallback rule is silent where another rule reports. One that is per
+    kind judges one node of each kind (`trial_rendering`): what it finds in its `extra_uci` is wrong in that of the
+    others, too."""
 
     code: str
     severity: Severity
@@ -64,6 +66,7 @@ class Rule:
     check_text: TextCheck | None = None
     name: str = field(default="", kw_only=True)
     is_fallback: bool = field(default=False, kw_only=True)
+    is_per_kind: bool = field(default=False, kw_only=True)
 
 
 def fleet_rule(
@@ -76,12 +79,13 @@ def fleet_rule(
     failing: str | Example,
     passing: str | Example,
     is_fallback: bool = False,
+    is_per_kind: bool = False,
 ) -> Callable[[FleetCheck], Rule]:
     """Turn the decorated function, which checks a fleet, into a rule."""
 
     def decorate(check: FleetCheck) -> Rule:
         made = _rule(code, severity, title, why, fix, failing, passing, name=_slug(check), check=check)
-        return replace(made, is_fallback=is_fallback)
+        return replace(made, is_fallback=is_fallback, is_per_kind=is_per_kind)
 
     return decorate
 

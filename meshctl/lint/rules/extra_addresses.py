@@ -26,6 +26,7 @@ _CAMERA = """
     fix="Use an address between them, such as the network's first address plus one.",
     failing=_CAMERA.replace("ADDRESS", "172.20.0.0/24"),
     passing=_CAMERA.replace("ADDRESS", "172.20.0.1/24"),
+    is_per_kind=True,
 )
 def interface_address_of_network(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     for node, packages in with_extra(fleet, context):

@@ -115,6 +115,7 @@ def ranges_overlap(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     fix="Choose a smaller `start`, or a larger network.",
     failing=_SERVING.replace("START", "300"),
     passing=_SERVING.replace("START", "120"),
+    is_per_kind=True,
 )
 def range_outside(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     for served in _ranges(fleet, context):

@@ -31,6 +31,7 @@ _UPLINK = """
     the zone of the mesh, set options of `firewall.management`.""",
     failing=_UPLINK.replace("firewall.wan.network: wan", "firewall.wan.network: lan"),
     passing=_UPLINK,
+    is_per_kind=True,
 )
 def zone_taken(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     for node, packages in with_parts(fleet, context):
@@ -56,6 +57,7 @@ def zone_taken(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     with that reason.""",
     failing=_UPLINK.replace("REJECT", "ACCEPT"),
     passing=_UPLINK,
+    is_per_kind=True,
 )
 def uplink_open(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     for node, packages in with_parts(fleet, context):

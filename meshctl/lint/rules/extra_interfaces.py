@@ -65,6 +65,7 @@ _CAMERA = """
     fix="Add the option that the finding names.",
     failing=_GUEST.replace("wireless.guest.ssid: guests,", "").replace("MORE", ""),
     passing=_GUEST.replace("MORE", ""),
+    is_per_kind=True,
 )
 def section_incomplete(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     for node, packages in with_extra(fleet, context):
@@ -98,6 +99,7 @@ def _needed(package: str, section: Section) -> tuple[str, ...]:
     access point off on purpose, set `disabled` of its own section.""",
     failing=_GUEST.replace("radio0", "radio1").replace("MORE", ""),
     passing=_GUEST.replace("radio0", "radio1").replace("MORE", "wireless.radio1.disabled: '0',"),
+    is_per_kind=True,
 )
 def radio_off(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     for node, packages in with_extra(fleet, context):
@@ -121,6 +123,7 @@ def radio_off(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     fix="Choose another name of at most 15 letters, digits and hyphens, or leave out `ifname`.",
     failing=_GUEST.replace("MORE", "wireless.guest.ifname: mesh0,"),
     passing=_GUEST.replace("MORE", "wireless.guest.ifname: guest0,"),
+    is_per_kind=True,
 )
 def name_unusable(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     for node, packages in with_extra(fleet, context):
@@ -161,6 +164,7 @@ def _taken(node: Node, packages: Mapping[str, Package], section: Section) -> set
     fix="Add the option that the finding names; `proto: none` states that the interface has no address.",
     failing=_CAMERA.replace("MORE", "network.camera.proto: static, network.camera.ipaddr: 172.20.0.1"),
     passing=_CAMERA.replace("MORE", "network.camera.proto: static, network.camera.ipaddr: 172.20.0.1/24"),
+    is_per_kind=True,
 )
 def interface_without_address(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     for node, packages in with_extra(fleet, context):
@@ -213,6 +217,7 @@ def _has_device(name: str, interface: Section, packages: Mapping[str, Package]) 
     hardware: {rocket: {radios: {radio1: {driver: ath10k-ct}}}}
     nodes: {b01: {extra_uci: {wireless.radio1.channel: '36', wireless.radio1.htmode: VHT80}}}
     """,
+    is_per_kind=True,
 )
 def extra_htmode(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     country = context.regdb.country(fleet.country)

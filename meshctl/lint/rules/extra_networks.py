@@ -36,6 +36,7 @@ def is_on(section: Section, option: str) -> bool:
     nodes: {base: {extra_uci: {dhcp.lan.ignore: '0', dhcp.lan.start: '120', dhcp.lan.dhcpv4: server,
       dhcp.dns: dnsmasq, dhcp.dns.authoritative: '1'}}}
     """,
+    is_per_kind=True,
 )
 def address_server_off(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     for node, packages in with_extra(fleet, context):
@@ -99,6 +100,7 @@ def _has_server(dhcp: Package, served: Section) -> bool:
     nodes: {b01: {extra_uci: {network.camera: interface, network.camera.device: eth1, network.camera.proto: static,
       network.camera.ipaddr: 172.20.0.1, network.camera.netmask: 255.255.255.0}}}
     """,
+    is_per_kind=True,
 )
 def interface_overlaps(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     for node, packages in with_extra(fleet, context):
@@ -162,6 +164,7 @@ def _network(address: str, netmask: str) -> IpNetwork | None:
     nodes: {b01: {extra_uci: {wireless.uplink: wifi-iface, wireless.uplink.device: radio0, wireless.uplink.mode: sta,
       wireless.uplink.ssid: hq, wireless.uplink.wds: '1', wireless.uplink.network: lan}}}
     """,
+    is_per_kind=True,
 )
 def interface_not_attachable(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     for node, packages in with_extra(fleet, context):
@@ -202,6 +205,7 @@ def _is_bridge(network: Package, interface: Section) -> bool:
       wireless.guest.ssid: guests, wireless.guest.encryption: none, wireless.guest.network: visitors,
       network.visitors: interface, network.visitors.proto: none}}}
     """,
+    is_per_kind=True,
 )
 def access_point_open(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     for node, packages in with_extra(fleet, context):

@@ -77,6 +77,7 @@ _SYNONYMS = {("firewall", "zone", "masquerade"): "masq", ("firewall", "zone", "n
     fix="Choose one of the channels that the finding names, or `auto`.",
     failing="nodes: {b01: {extra_uci: {wireless.radio1.channel: '6'}}}",
     passing="nodes: {b01: {extra_uci: {wireless.radio1.channel: '36'}}}",
+    is_per_kind=True,
 )
 def extra_channel(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     country = context.regdb.country(fleet.country)
@@ -111,6 +112,7 @@ def extra_channel(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
       wireless.guest.ssid: guests, wireless.guest.isolate: '1', wireless.guest.network: visitors,
       network.visitors: interface, network.visitors.proto: none}}}
     """,
+    is_per_kind=True,
 )
 def option_misspelled(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     for node, packages in with_extra(fleet, context):
@@ -160,6 +162,7 @@ _INTERFACE = ("network", "interface")
       wireless.guest.ssid: guests, wireless.guest.network: visitors, network.visitors: interface,
       network.visitors.proto: none}}}
     """,
+    is_per_kind=True,
 )
 def access_point_power(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     country = context.regdb.country(fleet.country)

@@ -33,6 +33,7 @@ _WITH_PASSPHRASE = ("psk", "sae", "wep")
       wireless.guest.ssid: guests, wireless.guest.network: visitors, wireless.guest.encryption: owe,
       network.visitors: interface, network.visitors.proto: none}}}
     """,
+    is_per_kind=True,
 )
 def passphrase_missing(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     for node, packages in with_extra(fleet, context):
@@ -55,6 +56,7 @@ def passphrase_missing(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     as `bat0.30`.""",
     failing="nodes: {b01: {extra_uci: {network.wan: interface, network.wan.proto: dhcp, network.wan.device: eth0}}}",
     passing="nodes: {b01: {extra_uci: {network.wan: interface, network.wan.proto: dhcp, network.wan.device: eth1}}}",
+    is_per_kind=True,
 )
 def port_used_twice(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     for node, packages in with_extra(fleet, context):

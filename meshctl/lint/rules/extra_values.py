@@ -181,6 +181,7 @@ _TYPES = {
       wireless.guest.ssid: guests, wireless.guest.network: visitors, network.visitors: interface,
       network.visitors.proto: none}}}
     """,
+    is_per_kind=True,
 )
 def value_unknown(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     for node, packages in with_extra(fleet, context):

@@ -80,6 +80,7 @@ def _named_folder(fleet: Fleet, node: Node, item: Diagnostic) -> Finding | None:
     in the firewall package.""",
     failing="nodes: {b01: {extra_uci: {firewall.management.input: REJECT}}}",
     passing="nodes: {b01: {extra_uci: {firewall.management.masq: '1'}}}",
+    is_per_kind=True,
 )
 def management_shut_out(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     for node, outcome in context.trial.of(fleet):
@@ -118,6 +119,7 @@ def _accepts_input(firewall: uci.Package, network: str) -> bool:
     failing="nodes: {b01: {extra_uci: {'wireless.radio0 .rts': '500'}}}",
     passing="nodes: {b01: {extra_uci: {wireless.radio0.rts: '500'}}}",
     is_fallback=True,
+    is_per_kind=True,
 )
 def value_unwritable(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     seen = set()
@@ -151,6 +153,7 @@ def value_unwritable(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
       wireless.guest.ssid: guests, wireless.guest.network: visitors, network.visitors: interface,
       network.visitors.proto: none}}}
     """,
+    is_per_kind=True,
 )
 def extra_names_nothing(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     for node, packages in with_extra(fleet, context):
@@ -256,6 +259,7 @@ _REFERENCES = {
     passing="""
     nodes: {b01: {extra_uci: {'system.@system[0].cronloglevel': '9', system.led1: led, system.led1.sysfs: usb}}}
     """,
+    is_per_kind=True,
 )
 def extra_section_unread(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     for node in kinds(fleet):

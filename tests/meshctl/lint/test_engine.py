@@ -35,6 +35,21 @@ nodes: {"c[01-07]": {groups: [strong], address: {from: 10.42.0.121}}}
     assert "also c02, c03, c04, c05 and 2 more" in finding.message
 
 
+def test_a_mistake_in_the_options_of_nodes_alike_is_found_in_each(tmp_path: Path) -> None:
+    """One node of each kind is rendered: the others were missing, also at lines of their own."""
+    wrong = "{wireless.mesh0.network: nothing}"
+    own_lines = f"""
+    nodes:
+      b01: {{extra_uci: {wrong}}}
+      b02: {{role: beacon, address: 10.42.0.112, hardware: rocket, extra_uci: {wrong}}}
+    """
+    found = [item for item in _found(own_lines, tmp_path) if item.code == "MC904"]
+    assert [(item.path, item.message) for item in found] == [
+        (f"nodes.{name}.extra_uci.wireless.mesh0.network", "no interface of network") for name in ("b01", "b02")
+    ]
+    assert len({item.position for item in found}) == 2
+
+
 def test_findings_are_in_file_order(tmp_path: Path) -> None:
     found = _found("{meshes: {main: {channel: 13, mtu: 1400}}, apply: {quorum: 0.1}, country: XX}", tmp_path)
     assert [item.code for item in found] == ["MC321", "MC506", "MC615"]
