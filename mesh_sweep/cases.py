@@ -67,8 +67,8 @@ def parse_parameters(words: Iterable[str], short: Mapping[str, str]) -> tuple[Pa
         elif len(set(values)) != len(values):
             twice = next(value for value in values if values.count(value) > 1)
             problems.append(f"--set {word}: expected each value once, found {twice!r} twice")
-        elif near := difflib.get_close_matches(path, short, n=1, cutoff=_SIMILAR):
-            # no scenario has a key so similar to one of these, and its own keys would be suggested otherwise
+        elif "." not in path and (near := difflib.get_close_matches(path, short, n=1, cutoff=_SIMILAR)):
+            # no file has such a key at its top, and one that is there would be suggested otherwise
             problems.append(f"--set {word}: expected a path or a short name, found {path!r}; did you mean {near[0]!r}?")
         elif path == "seed":
             problems.append(f"--set {word}: expected no seeds here; use --seeds")
