@@ -12,6 +12,7 @@ import re
 import shutil
 import socket
 import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -86,6 +87,8 @@ class Server:
         # unshare --kill-child: the namespace's first process goes with it, and with that one all others
         self._process.kill()
         self._process.wait(timeout=PATIENCE_S)
+        # shown with a test that fails: why the server ended a connection
+        sys.stdout.write(self._log.read_text(encoding="utf-8", errors="replace"))
 
     def __enter__(self) -> Server:
         return self
