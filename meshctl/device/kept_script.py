@@ -8,8 +8,10 @@ starts no shell and parses nothing. The shell ends with its standard input, that
 
 from __future__ import annotations
 
+import math
 import re
 import secrets
+import time
 from collections.abc import Sequence
 
 import paramiko
@@ -17,7 +19,7 @@ import paramiko
 from meshctl.device.connection import Completed
 from meshctl.device.errors import OutputTooLarge
 from meshctl.device.framing import framed, quoted
-from meshctl.device.ssh_channel import MAX_OUTPUT_BYTES, OPEN_ATTEMPTS, open_session
+from meshctl.device.ssh_channel import DISCARD_S, MAX_OUTPUT_BYTES, OPEN_ATTEMPTS, open_session
 
 _READ_BYTES = 32 << 10
 _END = re.compile(rb"(ended-[0-9a-f]{32}) (\d{1,3})\n\Z")
@@ -67,20 +69,31 @@ class KeptScript:
 
     def run(self, arguments: Sequence[str]) -> Completed:
         """Run the script with these arguments; it has no standard error. Raises what paramiko raises, EOFError if the
-        shell ends, OutputTooLarge, and ValueError for an argument with a line break."""
+        shell ends, OutputTooLarge, and ValueError for an argument with a line break.
+
+        What is too much is read to its end, if that comes soon: dropbear 2022.83 may end the connection by an assertion
+        (common-channel.c, `!channel->sent_close`) when a channel is closed that still has output.
+        """
         mark = f"ended-{secrets.token_hex(16)}"
         line = f"{mark} {quoted(*arguments)}\n"
         if line.count("\n") > 1:
             raise ValueError("a line break in an argument")
         self._channel.sendall(line.encode())
         output = bytearray()
+        discard_until = math.inf
         while (ended := _END.search(output, max(0, len(output) - _END_BYTES))) is None or ended[1] != mark.encode():
             data = self._channel.recv(_READ_BYTES)
             if not data:
                 raise EOFError("the node's shell ended")
             output += data
             if len(output) > MAX_OUTPUT_BYTES:
-                raise OutputTooLarge(f"{self._label}: the command printed more than {MAX_OUTPUT_BYTES >> 20} MiB")
+                discard_until = min(discard_until, time.monotonic() + DISCARD_S)
+                # the mark may have come in part
+                del output[:-_END_BYTES]
+            if time.monotonic() > discard_until:
+                break
+        if ended is None or discard_until < math.inf:
+            raise OutputTooLarge(f"{self._label}: the command printed more than {MAX_OUTPUT_BYTES >> 20} MiB")
         return Completed(bytes(output[: ended.start()]), b"", int(ended[2]))
 
     def close(self) -> None:

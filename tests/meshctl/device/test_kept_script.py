@@ -5,10 +5,14 @@ from __future__ import annotations
 import os
 import signal
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
+import paramiko
 import pytest
 
 from meshctl.device.errors import ChannelClosed, OutputTooLarge, Timeout
+from meshctl.device.kept_script import KeptScript
 from meshctl.device.observe import observe_again
 from meshctl.device.ssh import SshConnection
 from meshctl.device.ssh_channel import MAX_OUTPUT_BYTES
@@ -108,6 +112,19 @@ def test_too_much_output_is_an_error_and_the_next_run_answers(connection: SshCon
     with pytest.raises(OutputTooLarge):
         connection.run_kept(script, [str(MAX_OUTPUT_BYTES + 1)])
     assert len(connection.run_kept(script, ["1000"]).stdout_bytes) == 1000
+
+
+def test_too_much_output_is_read_to_its_end() -> None:
+    """dropbear 2022.83 may end the connection when a channel is closed that still has output."""
+    left = [b"x" * (1 << 20)] * (3 * MAX_OUTPUT_BYTES >> 20)
+
+    def send(line: bytes) -> None:
+        left.extend((line.split()[0], b" 0\n"))
+
+    channel = SimpleNamespace(sendall=send, recv=lambda _: left.pop(0))
+    with pytest.raises(OutputTooLarge):
+        KeptScript(cast(paramiko.Channel, channel), "b03").run(["1000"])
+    assert left == []
 
 
 def test_an_argument_with_a_line_break_is_refused(connection: SshConnection) -> None:
