@@ -88,7 +88,7 @@ class Server:
         self._process.kill()
         self._process.wait(timeout=PATIENCE_S)
         # shown with a test that fails: why the server ended a connection
-        sys.stdout.write(self._log.read_text(encoding="utf-8", errors="replace"))
+        sys.stderr.write(self._log.read_text(encoding="utf-8", errors="replace"))
 
     def __enter__(self) -> Server:
         return self
