@@ -3,4 +3,4 @@
 The flow: inventory -> model -> lint -> resolve -> render -> plan -> apply -> verify -> report (docs/design.md).
 """
 
-__version__ = "0.7.0"
+__version__ = "0.6.0"

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from udp_mesh.daemon.outbox import DirectoryStore as DirectoryStore
     from udp_mesh.links.attachments import LinkConfig as LinkConfig
 
-__version__ = "0.7.0"
+__version__ = "0.6.0"
 
 _EXPORTS = {
     "Node": "udp_mesh.daemon.api_node",
