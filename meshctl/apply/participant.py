@@ -1,4 +1,4 @@
-"""A node of a simultaneous change: how far it got, which quorum it counts for, and why it failed. Pure."""
+"""A node of a simultaneous change: how far it got, which quorum it counts for, and why it failed."""
 
 from __future__ import annotations
 

@@ -79,7 +79,8 @@ class NodeAlarmInput:
 
 def alarms(facts: NodeAlarmInput) -> tuple[Alarm, ...]:
     """All alarms of a node, most severe first."""
-    found = [alarm for concern in _CONCERNS for alarm in concern(facts)]
+    concerns = [concern for concern in _CONCERNS if not (facts.is_reloading and concern in _OF_RADIOS)]
+    found = [alarm for concern in concerns for alarm in concern(facts)]
     return tuple(sorted(found, key=lambda alarm: -alarm.level))
 
 
@@ -111,16 +112,12 @@ def _drift(facts: NodeAlarmInput) -> Iterator[Alarm]:
 
 def _left_over(facts: NodeAlarmInput) -> Iterator[Alarm]:
     """A mesh that it has left may still be joined through it, and others may be disturbed on its channel."""
-    if facts.is_reloading:
-        return
     for name in left_over(facts.observation):
         text = f"{name} is on the air, although its configuration has turned it off"
         yield Alarm(Level.WARNING, "left-over", text, f"meshctl provision {facts.node.name} takes it down")
 
 
 def _radios(facts: NodeAlarmInput) -> Iterator[Alarm]:
-    if facts.is_reloading:
-        return
     mesh_radios = {radio.name for radio in facts.node.radios if radio.mesh is not None}
     for radio in facts.observation.radios or ():
         if radio.name in mesh_radios and (not radio.up or radio.setup_failed):
@@ -141,8 +138,6 @@ def _radios(facts: NodeAlarmInput) -> Iterator[Alarm]:
 
 
 def _mesh(facts: NodeAlarmInput) -> Iterator[Alarm]:
-    if facts.is_reloading:
-        return
     if facts.must_mesh and not facts.neighbors:
         yield Alarm(
             Level.ERROR,
@@ -270,3 +265,5 @@ _CONCERNS: tuple[Callable[[NodeAlarmInput], Iterator[Alarm]], ...] = (
     _changes,
     _time,
 )
+# what a radio that restarts in a change causes by itself
+_OF_RADIOS = (_radios, _left_over, _mesh)

@@ -345,8 +345,9 @@ class MeshClient:
         if self._dropped:
             dropped, self._dropped = self._dropped, 0
             return {"event": "dropped", "messages": dropped}, b""
-        if not self._events:
-            return None
+        return self._pop_event() if self._events else None
+
+    def _pop_event(self) -> Frame:
         frame = self._events.popleft()
         self._unread_bytes -= EVENT_BYTES + len(frame[1])
         return frame
@@ -453,9 +454,7 @@ class MeshClient:
                     self._events.append((header, payload))
                     self._unread_bytes += EVENT_BYTES + len(payload)
             while self._unread_bytes > MAX_UNREAD_BYTES and len(self._events) > 1:
-                header, payload = self._events.popleft()
-                self._unread_bytes -= EVENT_BYTES + len(payload)
-                self._dropped += header.get("event") == "message"
+                self._dropped += self._pop_event()[0].get("event") == "message"
         return True
 
 
