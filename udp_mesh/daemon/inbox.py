@@ -19,7 +19,7 @@ import asyncio
 import contextlib
 import logging
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 from udp_mesh.core.events import MessageReceived, Receipt
@@ -131,11 +131,7 @@ class Inbox:
             held = self._held.get(key)
             if held is None or held.receipt is None:
                 continue
-            held.on_disk = self._store.holds(key)
-            if held.on_disk:
-                self._confirm(held.receipt)
-                held.receipt = None
-            elif not held.reading:
+            if not self._confirm_on_disk(key, held, held.receipt) and not held.reading:
                 self._drop(key, held)
 
     async def confirm_stored(self) -> None:
@@ -146,15 +142,18 @@ class Inbox:
                 for _ in range(2):
                     keys = list(self._held)
                     await asyncio.wrap_future(self._store.flush())
-                    self._confirm_those_on_disk(keys)
+                    for key in keys:
+                        held = self._held.get(key)
+                        if held is not None and held.receipt is not None and held.item is None:
+                            self._confirm_on_disk(key, held, held.receipt)
 
-    def _confirm_those_on_disk(self, keys: Iterable[int]) -> None:
-        for key in keys:
-            held = self._held.get(key)
-            if held is not None and held.receipt is not None and held.item is None and self._store.holds(key):
-                held.on_disk = True
-                self._confirm(held.receipt)
-                held.receipt = None
+    def _confirm_on_disk(self, key: int, held: _Held, receipt: Receipt) -> bool:
+        """Confirm the message if it is on disk; whether it is."""
+        held.on_disk = self._store.holds(key)
+        if held.on_disk:
+            self._confirm(receipt)
+            held.receipt = None
+        return held.on_disk
 
     def _drop(self, key: int, held: _Held) -> None:
         self._release(key)

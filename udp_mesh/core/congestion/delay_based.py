@@ -174,7 +174,7 @@ class DelayBasedController:
 
     def assume_delivery(self) -> bool:
         # A drain wants the queue empty.
-        return self.phase in (Phase.STARTUP, Phase.CRUISE) and bool(self._rate)
+        return self.phase in (Phase.STARTUP, Phase.CRUISE) and self._rate.maximum is not None
 
     def is_queue_explained(self) -> bool:
         return not self._unexplained_queue()

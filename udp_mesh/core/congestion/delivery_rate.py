@@ -15,9 +15,6 @@ class DeliveryRate:
         self._samples: deque[tuple[float, float]] = deque()
         self.maximum: float | None = None
 
-    def __bool__(self) -> bool:
-        return bool(self._samples)
-
     def is_current(self, now: float) -> bool:
         """Whether the maximum is a sample within the window: of an application-limited sender the last one stays."""
         return bool(self._samples) and self._samples[0][0] >= now - RATE_WINDOW_S
